@@ -1,0 +1,54 @@
+//! The command line: one file per subcommand. The only place for anyhow, printing, progress bars and tables.
+#![expect(clippy::print_stdout, clippy::print_stderr, reason = "the face of the program prints")]
+
+mod ui;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// Record, measure, train and compare agents that talk over unreliable links.
+#[derive(Debug, Parser)]
+#[command(name = "ccmarl", version, about, propagate_version = true, arg_required_else_help = true, max_term_width = 100)]
+pub struct Cli {
+    /// What to do
+    #[command(subcommand)]
+    command: Command,
+}
+
+/// The subcommands.
+#[derive(Debug, Subcommand)]
+enum Command {}
+
+/// How a command ended, when it did not fail.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// All done (exit code 0).
+    Done,
+    /// Done, and data was lost, which was reported (exit code 3).
+    DataLost,
+    /// Interrupted in good order; can be resumed (exit code 4).
+    Interrupted,
+}
+
+/// Parses the arguments, runs the command, and turns the outcome into the process's exit code:
+/// 0 done, 1 error, 2 usage, 3 finished with data loss reported, 4 interrupted and resumable.
+pub fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => {
+            let code = u8::try_from(error.exit_code()).unwrap_or(2);
+            return if error.print().is_ok() { ExitCode::from(code) } else { ExitCode::SUCCESS };
+        }
+    };
+    match dispatch(cli.command) {
+        Ok(Outcome::Done) => ExitCode::SUCCESS,
+        Ok(Outcome::DataLost) => ExitCode::from(3),
+        Ok(Outcome::Interrupted) => ExitCode::from(4),
+        Err(error) => ui::report_error(&error),
+    }
+}
+
+fn dispatch(command: Command) -> anyhow::Result<Outcome> {
+    match command {}
+}

@@ -1,0 +1,149 @@
+//! Files: atomic writes, directories that appear whole, digests.
+
+use std::fs::File;
+use std::io::{Read as _, Write as _};
+use std::path::{Path, PathBuf};
+
+use sha2::{Digest as _, Sha256};
+
+use crate::schema::hex;
+
+/// What can go wrong with a path. The path comes last.
+#[derive(Debug, thiserror::Error)]
+pub enum IoError {
+    /// The operating system refused.
+    #[error("could not {action}: {source}: {}", path.display())]
+    Os {
+        /// What was tried, as a verb phrase.
+        action: &'static str,
+        /// The reason given.
+        source: std::io::Error,
+        /// Where.
+        path: PathBuf,
+    },
+    /// The output is already there.
+    #[error("output exists: give --force to replace it, or another --out: {}", .0.display())]
+    Exists(PathBuf),
+    /// Nothing there.
+    #[error("no such file or directory: {}", .0.display())]
+    Missing(PathBuf),
+    /// `--force` would replace something that this program did not make.
+    #[error("refusing to replace a directory that ccmarl did not make; remove it by hand: {}", .0.display())]
+    Foreign(PathBuf),
+}
+
+impl IoError {
+    /// Wraps an operating-system error; for `map_err`.
+    pub fn os(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.to_owned();
+        move |source| Self::Os { action, source, path }
+    }
+}
+
+/// Refuses an output path that exists, unless `force`.
+///
+/// # Errors
+/// [`IoError::Exists`].
+pub fn refuse_existing(path: &Path, force: bool) -> Result<(), IoError> {
+    if !force && path.symlink_metadata().is_ok() { Err(IoError::Exists(path.to_owned())) } else { Ok(()) }
+}
+
+/// Reads a whole text file of at most `limit` bytes.
+///
+/// # Errors
+/// [`IoError::Missing`], [`IoError::Os`] (also when the file is larger, or not UTF-8).
+pub fn read_text(path: &Path, limit: u64) -> Result<String, IoError> {
+    if !path.exists() {
+        return Err(IoError::Missing(path.to_owned()));
+    }
+    let mut text = String::new();
+    let file = File::open(path).map_err(IoError::os("open", path))?;
+    file.take(limit + 1).read_to_string(&mut text).map_err(IoError::os("read as UTF-8 text", path))?;
+    if text.len() as u64 > limit {
+        let too_large = std::io::Error::other(format!("larger than the limit of {limit} bytes"));
+        return Err(IoError::os("read", path)(too_large));
+    }
+    Ok(text)
+}
+
+/// Writes a file that is there whole, with all its bytes on disk, or not at all. Makes missing parent directories.
+///
+/// # Errors
+/// [`IoError::Os`].
+pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), IoError> {
+    create_parent(path)?;
+    let mut file = atomic_write_file::AtomicWriteFile::open(path).map_err(IoError::os("create", path))?;
+    file.write_all(bytes).map_err(IoError::os("write", path))?;
+    file.commit().map_err(IoError::os("put in place", path))
+}
+
+/// Makes the directories above `path`.
+///
+/// # Errors
+/// [`IoError::Os`].
+pub fn create_parent(path: &Path) -> Result<(), IoError> {
+    match path.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => {
+            std::fs::create_dir_all(parent).map_err(IoError::os("create the directory", parent))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// The sibling `.<name>.partial` in which an output is built before it takes its name.
+pub fn partial_path(path: &Path) -> PathBuf {
+    let name = path.file_name().map_or_else(|| "out".into(), |n| n.to_string_lossy().into_owned());
+    path.with_file_name(format!(".{name}.partial"))
+}
+
+/// Puts a finished file or directory under its final name, replacing what `force` allows it to replace.
+///
+/// A directory is replaced only if it is empty or holds `marker` (the file that says that ccmarl made it).
+///
+/// # Errors
+/// [`IoError::Exists`], [`IoError::Foreign`], [`IoError::Os`].
+pub fn publish(from: &Path, to: &Path, force: bool, marker: &str) -> Result<(), IoError> {
+    refuse_existing(to, force)?;
+    if to.is_dir() {
+        let empty = std::fs::read_dir(to).map_err(IoError::os("list", to))?.next().is_none();
+        if !empty && !to.join(marker).exists() {
+            return Err(IoError::Foreign(to.to_owned()));
+        }
+        std::fs::remove_dir_all(to).map_err(IoError::os("replace", to))?;
+    }
+    std::fs::rename(from, to).map_err(IoError::os("put in place", to))?;
+    sync_dir(to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")))
+}
+
+/// Makes a rename in `dir` durable.
+///
+/// # Errors
+/// [`IoError::Os`].
+pub fn sync_dir(dir: &Path) -> Result<(), IoError> {
+    File::open(dir).and_then(|d| d.sync_all()).map_err(IoError::os("sync", dir))
+}
+
+/// SHA-256 of a file, 64 hex digits, and its size in bytes; reads in blocks.
+///
+/// # Errors
+/// [`IoError::Missing`], [`IoError::Os`].
+pub fn sha256_file(path: &Path) -> Result<(String, u64), IoError> {
+    if !path.exists() {
+        return Err(IoError::Missing(path.to_owned()));
+    }
+    let mut file = File::open(path).map_err(IoError::os("open", path))?;
+    let (mut hash, mut block, mut size) = (Sha256::new(), vec![0; 1 << 18], 0);
+    loop {
+        let n = file.read(&mut block).map_err(IoError::os("read", path))?;
+        if n == 0 {
+            return Ok((hex(&hash.finalize()), size));
+        }
+        hash.update(&block[..n]);
+        size += n as u64;
+    }
+}
+
+/// Text that came from a file, safe to print on a terminal: control characters are shown escaped.
+pub fn printable(text: &str) -> String {
+    text.chars().flat_map(|c| if c.is_control() { c.escape_default().collect() } else { vec![c] }).collect()
+}

@@ -1,0 +1,209 @@
+//! Plugins: a const slice of entries per kind, and the way a user names one.
+//!
+//! A plugin is written `name` or `name:value` on the command line and `{ name = …, … }` in TOML and JSON. Everything
+//! that knows plugins (help, `list`, "did you mean", contract tests) derives from the slices.
+
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde_json::{Map, Value};
+
+/// One registered plugin of a kind. `B` is the kind's constructor.
+#[derive(Clone, Copy, Debug)]
+pub struct Entry<B> {
+    /// The name a user types, in kebab or snake case as the field writes it.
+    pub name: &'static str,
+    /// One line for `ccmarl list` and `--help`.
+    pub summary: &'static str,
+    /// Paper, equation or source that defines it.
+    pub reference: &'static str,
+    /// The parameter that `name:value` sets, if the plugin takes one.
+    pub value: Option<&'static str>,
+    /// Builds it.
+    pub build: B,
+}
+
+/// What goes wrong between a user's words and a plugin.
+#[derive(Debug, thiserror::Error)]
+pub enum RegistryError {
+    /// No plugin of that kind has this name.
+    #[error("unknown {kind} {name:?}: {hint} (`ccmarl list` shows all)")]
+    Unknown {
+        /// What was looked for: `scenario`, `link`, …
+        kind: &'static str,
+        /// What the user typed.
+        name: String,
+        /// The nearest names, or all of them.
+        hint: String,
+    },
+    /// `name:value` for a plugin that takes no value.
+    #[error("{kind} {name:?} takes no value, but {value:?} was given: write just {name}")]
+    NoValue {
+        /// Kind of plugin.
+        kind: &'static str,
+        /// Its name.
+        name: String,
+        /// The superfluous value.
+        value: String,
+    },
+    /// A parameter is missing, unknown, of the wrong type or out of range.
+    #[error("{name}: {message}")]
+    Params {
+        /// The plugin.
+        name: String,
+        /// What is wrong, and the allowed range.
+        message: String,
+    },
+}
+
+/// A plugin as a user names it: its name and its parameters. Serialises as one flat table `{name, …}`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Spec {
+    /// The plugin's name.
+    pub name: String,
+    /// Its parameters, as given.
+    pub params: Map<String, Value>,
+}
+
+impl Spec {
+    /// A plugin without parameters.
+    pub fn new(name: &str) -> Self {
+        Self { name: name.to_owned(), params: Map::new() }
+    }
+
+    /// The same plugin with one more parameter.
+    #[must_use]
+    pub fn with(mut self, key: &str, value: impl Into<Value>) -> Self {
+        self.params.insert(key.to_owned(), value.into());
+        self
+    }
+
+    /// Reads `name` or `name:value` against a registry.
+    ///
+    /// # Errors
+    /// [`RegistryError::Unknown`] with the nearest names, [`RegistryError::NoValue`].
+    pub fn parse<B>(kind: &'static str, entries: &[Entry<B>], text: &str) -> Result<Self, RegistryError> {
+        let (name, value) = text.split_once(':').map_or((text, None), |(n, v)| (n, Some(v)));
+        let entry = find(kind, entries, name)?;
+        let mut spec = Self::new(entry.name);
+        if let Some(value) = value {
+            let Some(key) = entry.value else {
+                return Err(RegistryError::NoValue { kind, name: name.to_owned(), value: value.to_owned() });
+            };
+            let parsed = value.parse::<f64>().ok().filter(|v| v.is_finite());
+            let json = match (value.parse::<i64>(), parsed) {
+                (Ok(whole), _) => Value::from(whole),
+                (_, Some(number)) => Value::from(number),
+                _ => Value::from(value),
+            };
+            spec.params.insert(key.to_owned(), json);
+        }
+        Ok(spec)
+    }
+
+    /// The parameters as a checked type. Give `P` `#[serde(deny_unknown_fields, default)]`.
+    ///
+    /// # Errors
+    /// [`RegistryError::Params`] that names the field.
+    pub fn params<P: DeserializeOwned>(&self) -> Result<P, RegistryError> {
+        serde_json::from_value(Value::Object(self.params.clone()))
+            .map_err(|e| RegistryError::Params { name: self.name.clone(), message: e.to_string() })
+    }
+
+    /// An error about this plugin's parameters.
+    pub fn invalid(&self, message: impl Into<String>) -> RegistryError {
+        RegistryError::Params { name: self.name.clone(), message: message.into() }
+    }
+}
+
+impl std::fmt::Display for Spec {
+    /// `name`, or `name:value` when the one parameter is a scalar, else `name{…}`.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.name)?;
+        let mut values = self.params.iter().filter(|(_, v)| !v.is_null());
+        match (values.next(), values.next()) {
+            (None, _) => Ok(()),
+            (Some((_, Value::String(s))), None) => write!(f, ":{s}"),
+            (Some((_, v)), None) if v.is_number() => write!(f, ":{v}"),
+            _ => write!(f, "{}", Value::Object(self.params.clone())),
+        }
+    }
+}
+
+impl Serialize for Spec {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut flat = Map::new();
+        flat.insert("name".to_owned(), Value::from(self.name.clone()));
+        flat.extend(self.params.clone());
+        flat.serialize(serializer)
+    }
+}
+
+impl<'de> Deserialize<'de> for Spec {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let mut params = match Value::deserialize(deserializer)? {
+            Value::String(name) => return Ok(Self::new(&name)),
+            Value::Object(map) => map,
+            other => return Err(serde::de::Error::custom(format!("expected a name or {{ name = … }}, found {other}"))),
+        };
+        match params.remove("name") {
+            Some(Value::String(name)) => Ok(Self { name, params }),
+            _ => Err(serde::de::Error::custom("a plugin table needs the key `name`")),
+        }
+    }
+}
+
+/// The entry called `name`.
+///
+/// # Errors
+/// [`RegistryError::Unknown`] with the nearest names.
+pub fn find<'a, B>(kind: &'static str, entries: &'a [Entry<B>], name: &str) -> Result<&'a Entry<B>, RegistryError> {
+    entries.iter().find(|e| e.name == name).ok_or_else(|| RegistryError::Unknown {
+        kind,
+        name: name.to_owned(),
+        hint: did_you_mean(name, entries.iter().map(|e| e.name)),
+    })
+}
+
+/// "did you mean a, b?" for the candidates nearest to `name`, or the whole list when none is near.
+pub fn did_you_mean<'a>(name: &str, candidates: impl Iterator<Item = &'a str>) -> String {
+    let mut scored: Vec<(f64, &str)> = candidates.map(|c| (strsim::jaro_winkler(name, c), c)).collect();
+    scored.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(b.1)));
+    let near: Vec<&str> = scored.iter().filter(|(s, _)| *s > 0.75).take(3).map(|(_, c)| *c).collect();
+    if near.is_empty() {
+        let mut all: Vec<&str> = scored.iter().map(|(_, c)| *c).collect();
+        all.sort_unstable();
+        all.truncate(40);
+        format!("known are {}", all.join(", "))
+    } else {
+        format!("did you mean {}?", near.join(", "))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const KIND: &[Entry<()>] = &[
+        Entry { name: "dropout", summary: "", reference: "", value: Some("p"), build: () },
+        Entry { name: "perfect", summary: "", reference: "", value: None, build: () },
+    ];
+
+    #[test]
+    fn a_value_lands_under_the_entrys_key() {
+        let spec = Spec::parse("link", KIND, "dropout:0.2").unwrap();
+        assert_eq!(spec, Spec::new("dropout").with("p", 0.2));
+        assert_eq!(spec.to_string(), "dropout:0.2");
+        assert_eq!(serde_json::to_string(&spec).unwrap(), r#"{"name":"dropout","p":0.2}"#);
+        assert_eq!(serde_json::from_str::<Spec>(r#"{"name":"dropout","p":0.2}"#).unwrap(), spec);
+    }
+
+    #[test]
+    fn wrong_names_and_superfluous_values_say_what_to_do() {
+        let unknown = Spec::parse("link", KIND, "dropuot").unwrap_err().to_string();
+        assert_eq!(unknown, "unknown link \"dropuot\": did you mean dropout? (`ccmarl list` shows all)");
+        let none_near = Spec::parse("link", KIND, "zzz").unwrap_err().to_string();
+        assert!(none_near.contains("known are dropout, perfect"), "{none_near}");
+        let value = Spec::parse("link", KIND, "perfect:1").unwrap_err().to_string();
+        assert_eq!(value, "link \"perfect\" takes no value, but \"1\" was given: write just perfect");
+    }
+}
