@@ -1,6 +1,7 @@
 //! The command line: one file per subcommand. The only place for anyhow, printing, progress bars and tables.
 #![expect(clippy::print_stdout, clippy::print_stderr, reason = "the face of the program prints")]
 
+mod inspect;
 mod ui;
 
 use std::process::ExitCode;
@@ -18,7 +19,9 @@ pub struct Cli {
 
 /// The subcommands.
 #[derive(Debug, Subcommand)]
-enum Command {}
+enum Command {
+    Inspect(inspect::Args),
+}
 
 /// How a command ended, when it did not fail.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -50,5 +53,7 @@ pub fn main() -> ExitCode {
 }
 
 fn dispatch(command: Command) -> anyhow::Result<Outcome> {
-    match command {}
+    match command {
+        Command::Inspect(args) => inspect::run(&args),
+    }
 }
