@@ -1,4 +1,5 @@
 //! Compiles the .proto files of the MCAP store: Rust messages, and the descriptor set that goes into each file.
+#![expect(clippy::disallowed_methods, reason = "OUT_DIR is cargo's own")]
 
 use std::path::PathBuf;
 

@@ -154,7 +154,7 @@ impl Batch {
             let (values, at, width) = elements::<Float64Array>(array)?;
             e.state.extend_from_slice(&values.values()[(at + from) * width..][..n * width]);
         }
-        let mut floats = |array: Option<&ArrayRef>, n: usize, out: &mut Vec<f32>| -> Result<(), String> {
+        let floats = |array: Option<&ArrayRef>, n: usize, out: &mut Vec<f32>| -> Result<(), String> {
             if let Some(array) = array {
                 let (values, at, width) = elements::<Float32Array>(array)?;
                 let part = values.values().get((at + from) * width..(at + from + n) * width);

@@ -3,10 +3,9 @@
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use arrow::array::RecordBatch;
-use arrow::datatypes::{Schema, SchemaRef};
+use arrow::datatypes::{Metadata, Schema, SchemaRef};
 use arrow::error::ArrowError;
 use arrow::ipc::writer::StreamWriter;
 use parquet::file::metadata::KeyValue;
@@ -95,7 +94,8 @@ impl ParquetSink {
         let path = self.journal_path();
         let file = File::create_new(&path).map_err(IoError::os("create", &path))?;
         let fields = self.schema.fields().clone();
-        let schema = Schema::new_with_metadata(fields, [(MANIFEST_KEY.to_owned(), self.unsealed()?)].into());
+        let entries = Metadata::from([(MANIFEST_KEY, self.unsealed()?)]);
+        let schema = Schema::new_with_metadata(fields, entries);
         let writer = StreamWriter::try_new(BufWriter::with_capacity(1 << 18, file), &schema);
         self.journal = Some(writer.map_err(|e| refused(e, &path))?);
         Ok(())
