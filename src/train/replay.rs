@@ -116,6 +116,25 @@ impl Replay {
         Ok(())
     }
 
+    /// Takes over the arrays of a checkpoint: observations, actions, reward, bonus; link; episodes pushed.
+    ///
+    /// # Errors
+    /// What does not fit, as text.
+    pub(super) fn restore(&mut self, arrays: [Vec<f32>; 4], link: Vec<bool>, pushed: u64) -> Result<(), String> {
+        let episodes = pushed.min(self.capacity as u64) as usize;
+        let [o, a, l] = self.widths;
+        let (t, rows) = (episodes * self.steps, episodes * (self.steps + 1));
+        let found = [arrays[0].len(), arrays[1].len(), arrays[2].len(), arrays[3].len(), link.len()];
+        let expected = [rows * o, t * a, t, t, rows * l];
+        if found != expected {
+            return Err(format!("the replay arrays have lengths {found:?}, expected {expected:?}"));
+        }
+        let [observations, actions, reward, bonus] = arrays;
+        (self.observations, self.actions, self.reward, self.bonus) = (observations, actions, reward, bonus);
+        (self.link, self.pushed) = (link, pushed);
+        Ok(())
+    }
+
     /// Draws `rows` transitions with replacement into `batch`.
     pub fn sample<R: Rng + ?Sized>(&self, rng: &mut R, rows: usize, batch: &mut Batch) {
         let [o, a, l] = self.widths;
