@@ -1,6 +1,7 @@
 //! The command line: one file per subcommand. The only place for anyhow, printing, progress bars and tables.
 #![expect(clippy::print_stdout, clippy::print_stderr, reason = "the face of the program prints")]
 
+mod record;
 mod ui;
 
 use std::process::ExitCode;
@@ -18,7 +19,10 @@ pub struct Cli {
 
 /// The subcommands.
 #[derive(Debug, Subcommand)]
-enum Command {}
+enum Command {
+    /// Record episodes of a scenario under a policy and a link
+    Record(record::Args),
+}
 
 /// How a command ended, when it did not fail.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -50,5 +54,7 @@ pub fn main() -> ExitCode {
 }
 
 fn dispatch(command: Command) -> anyhow::Result<Outcome> {
-    match command {}
+    match command {
+        Command::Record(args) => record::run(&args),
+    }
 }
