@@ -1,7 +1,11 @@
 //! The command line: one file per subcommand. The only place for anyhow, printing, progress bars and tables.
 #![expect(clippy::print_stdout, clippy::print_stderr, reason = "the face of the program prints")]
 
+mod args;
+mod evaluate;
 mod inspect;
+mod record;
+mod train;
 mod ui;
 
 use std::process::ExitCode;
@@ -20,6 +24,13 @@ pub struct Cli {
 /// The subcommands.
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Record episodes of a scenario under a policy and a link
+    Record(record::Args),
+    /// Train a team over a link prior
+    Train(train::Args),
+    /// Test a trained team on every channel of a suite
+    Evaluate(evaluate::Args),
+    /// Show what a recorded store holds
     Inspect(inspect::Args),
 }
 
@@ -54,6 +65,9 @@ pub fn main() -> ExitCode {
 
 fn dispatch(command: Command) -> anyhow::Result<Outcome> {
     match command {
+        Command::Record(args) => record::run(&args),
+        Command::Train(args) => train::run(&args),
+        Command::Evaluate(args) => evaluate::run(&args),
         Command::Inspect(args) => inspect::run(&args),
     }
 }

@@ -1,2 +1,6 @@
 //! The one integration binary.
+
+mod links;
+mod record;
 mod stores;
+mod worlds;
