@@ -46,7 +46,7 @@ const RECORDING_RECORD: &str = "ccmarl.recording";
 const JSON_KEY: &str = "json";
 
 /// The MCAP store.
-pub const ENTRY: Entry<Format> = Entry {
+pub(super) const ENTRY: Entry<Format> = Entry {
     name: "mcap",
     summary: "one .mcap file of protobuf messages",
     reference: "MCAP specification",

@@ -19,13 +19,16 @@ pub const FORMATS: &[Entry<Format>] = &[mcap::ENTRY, parquet::ENTRY];
 /// Largest manifest that is read, bytes.
 const MANIFEST_LIMIT: u64 = 64 << 20;
 
+/// Starts a store at a path, for a manifest, with or without `force`.
+pub type Create = fn(&Path, &Manifest, bool) -> Result<Box<dyn EpisodeSink>, StorageError>;
+
 /// How a format is recognised, written and read.
 #[derive(Clone, Copy, Debug)]
 pub struct Format {
     /// Whether an output path asks for this format (by its extension).
     pub claims: fn(&Path) -> bool,
     /// Starts a store; nothing appears under `path` before [`EpisodeSink::finish`].
-    pub create: fn(&Path, &Manifest, bool) -> Result<Box<dyn EpisodeSink>, StorageError>,
+    pub create: Create,
     /// Opens a store for reading; checks its manifest and digests.
     pub open: fn(&Path) -> Result<Box<dyn EpisodeSource>, StorageError>,
 }

@@ -47,7 +47,7 @@ const PART_KEY: &str = "ccmarl.part";
 const FILE_SHA256_KEY: &str = "ccmarl.file_sha256";
 
 /// The Parquet store.
-pub const ENTRY: Entry<Format> = Entry {
+pub(super) const ENTRY: Entry<Format> = Entry {
     name: "parquet",
     summary: "a directory of Parquet parts with a manifest, or one .parquet file",
     reference: "Apache Parquet",
@@ -64,7 +64,7 @@ fn is_single(path: &Path) -> bool {
 }
 
 fn create(path: &Path, manifest: &Manifest, force: bool) -> Result<Box<dyn EpisodeSink>, StorageError> {
-    Ok(Box::new(sink::ParquetSink::create(path, manifest, force, is_single(path))?))
+    Ok(Box::new(sink::ParquetSink::create(path, manifest, force)?))
 }
 
 fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {

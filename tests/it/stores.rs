@@ -426,7 +426,8 @@ fn doubled_missing_or_mistyped_rows_are_errors_even_when_every_digest_is_right()
     let rows = concat_batches(&batches[0].schema(), &batches).unwrap();
     let mistyped = {
         let steps = cast(rows.column(1), &arrow::datatypes::DataType::Int64).unwrap();
-        let columns = rows.schema().fields().iter().zip(rows.columns()).map(|(f, c)| {
+        let schema = rows.schema();
+        let columns = schema.fields().iter().zip(rows.columns()).map(|(f, c)| {
             let column = if f.name() == "step" { std::sync::Arc::clone(&steps) } else { std::sync::Arc::clone(c) };
             (f.name().clone(), column, c.null_count() > 0)
         });

@@ -98,7 +98,9 @@ fn encode(
             Job::Rows(batch) => writer.write(&batch).map_err(|e| refused(e, path))?,
             Job::EndGroup => writer.flush().map_err(|e| refused(e, path))?,
             Job::EndFile(metadata, journals) => {
-                metadata.into_iter().for_each(|kv| writer.append_key_value_metadata(kv));
+                for entry in metadata {
+                    writer.append_key_value_metadata(entry);
+                }
                 let Some((writer, path)) = open.take() else { continue };
                 sealed.push(seal(writer, &path)?);
                 for journal in journals {

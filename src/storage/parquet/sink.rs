@@ -12,7 +12,7 @@ use parquet::file::metadata::KeyValue;
 
 use super::columns::{Block, row_bytes, schema};
 use super::encoder::{Encoder, Job, file_digest_entry};
-use super::{MANIFEST_FILE, MANIFEST_KEY, PART_KEY};
+use super::{MANIFEST_FILE, MANIFEST_KEY, PART_KEY, is_single};
 use crate::io::{self, IoError};
 use crate::schema::{Episode, Layout, Manifest, Part};
 use crate::storage::{EpisodeSink, StorageError, Tally, start_partial};
@@ -52,8 +52,9 @@ pub(super) struct ParquetSink {
 }
 
 impl ParquetSink {
-    /// Starts a store at `path`: one file when `single`, else a directory of parts.
-    pub(super) fn create(path: &Path, manifest: &Manifest, force: bool, single: bool) -> Result<Self, StorageError> {
+    /// Starts a store at `path`: one file when its extension says so, else a directory of parts.
+    pub(super) fn create(path: &Path, manifest: &Manifest, force: bool) -> Result<Self, StorageError> {
+        let single = is_single(path);
         let layout = manifest.layout();
         layout.check().map_err(|source| StorageError::Schema { source, path: path.to_owned() })?;
         let partial = start_partial(path, force)?;
