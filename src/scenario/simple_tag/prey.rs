@@ -6,8 +6,8 @@ use super::{Params, PreyScore};
 use crate::rng::Stream;
 use crate::scenario::World;
 
-/// Candidates scored at once: small arrays on the stack, in a form the compiler vectorises.
-const BLOCK: usize = 64;
+/// Candidates scored at once, the default number of them: small arrays on the stack, in a form that vectorises.
+const BLOCK: usize = 100;
 
 /// The prey's push: a point of the unit disc, or zero when every way is blocked.
 pub(super) fn choose(params: &Params, world: &World, rng: &mut Stream) -> [f64; 2] {
@@ -46,16 +46,17 @@ fn scores(params: &Params, world: &World, x: &[f64; BLOCK], y: &[f64; BLOCK]) ->
     let prey = params.agents;
     let touch = params.predator_size + params.prey_size;
     let mut score = [if params.prey_score == PreyScore::Sum { 0.0 } else { f64::INFINITY }; BLOCK];
-    let mut blocked = [false; BLOCK];
+    // Squared distance from the nearest predator on the way; a minimum vectorises, a flag does not.
+    let mut nearest = [f64::INFINITY; BLOCK];
     for predator in 0..prey {
         let d = world.offset(prey, predator);
-        // No way is longer than 1: who is farther than that and a touch blocks nothing.
-        if d[0] * d[0] + d[1] * d[1] < (1.0 + touch) * (1.0 + touch) {
-            for k in 1..=params.prey_waypoints {
-                let part = k as f64 / params.prey_waypoints as f64;
+        for k in 1..=params.prey_waypoints {
+            let part = k as f64 / params.prey_waypoints as f64;
+            // Waypoint k is at most `part` away from the prey: it cannot touch who is farther.
+            if d[0] * d[0] + d[1] * d[1] < (part + touch) * (part + touch) {
                 for c in 0..BLOCK {
                     let (dx, dy) = (d[0] - part * x[c], d[1] - part * y[c]);
-                    blocked[c] |= dx * dx + dy * dy < touch * touch;
+                    nearest[c] = less(dx * dx + dy * dy, nearest[c]);
                 }
             }
         }
@@ -64,14 +65,19 @@ fn scores(params: &Params, world: &World, x: &[f64; BLOCK], y: &[f64; BLOCK]) ->
             let distance = (dx * dx + dy * dy).sqrt();
             score[c] = match params.prey_score {
                 PreyScore::Sum => score[c] + distance,
-                PreyScore::Min => score[c].min(distance),
+                PreyScore::Min => less(score[c], distance),
             };
         }
     }
     for c in 0..BLOCK {
-        if blocked[c] {
+        if nearest[c] < touch * touch {
             score[c] = f64::NEG_INFINITY;
         }
     }
     score
+}
+
+/// The minimum in the form of one machine instruction (`f64::min` also orders NaN, which cannot occur here).
+fn less(a: f64, b: f64) -> f64 {
+    if a < b { a } else { b }
 }
