@@ -29,10 +29,12 @@ pub enum Error {
 impl Error {
     /// Whether the user's words are at fault (exit code 2), not the data or the machine (exit code 1).
     pub fn is_usage(&self) -> bool {
-        match self {
-            Self::Registry(_) | Self::Io(IoError::Exists(_)) | Self::Record(RecordError::NoEpisodes) => true,
-            Self::Storage(StorageError::Io(IoError::Exists(_))) => true,
-            _ => false,
-        }
+        matches!(
+            self,
+            Self::Registry(_)
+                | Self::Io(IoError::Exists(_))
+                | Self::Storage(StorageError::Io(IoError::Exists(_)))
+                | Self::Record(RecordError::NoEpisodes)
+        )
     }
 }
