@@ -78,13 +78,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let link = link::build(&link_spec, &setting).map_err(Error::from)?;
     let policy_spec = Spec::parse("policy", POLICIES, &args.policy).map_err(Error::from)?;
     let policy = record::build_policy(&policy_spec, &*scenario).map_err(Error::from)?;
-    let recording = Recording {
-        scenario: &*scenario,
-        link: &*link,
-        policy: &*policy,
-        seed: args.seed,
-        episodes: args.episodes,
-    };
+    let recording =
+        Recording { scenario: &*scenario, link: &*link, policy: &*policy, seed: args.seed, episodes: args.episodes };
     if args.episodes == 0 {
         return Err(Error::from(RecordError::NoEpisodes).into());
     }

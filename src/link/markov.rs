@@ -204,9 +204,7 @@ mod tests {
 
     #[test]
     fn malformed_chains_are_refused() {
-        let error = |json: &str| {
-            build(&serde_json::from_str(json).unwrap(), &SETTING).err().unwrap().to_string()
-        };
+        let error = |json: &str| build(&serde_json::from_str(json).unwrap(), &SETTING).err().unwrap().to_string();
         assert_eq!(
             error(r#"{"name":"markov","matrix":[[0.5,0.4],[1,0]]}"#),
             "markov: matrix row 0 must sum to 1, found 0.9"

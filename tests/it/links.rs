@@ -64,8 +64,7 @@ fn realised_loss_of_recorded_episodes() {
         ("markov:heavy", 0.1140),
     ] {
         let built = build(&Spec::parse("link", LINKS, link).unwrap(), &SETTING).unwrap();
-        let recording =
-            Recording { scenario: &*scenario, link: &*built, policy: &*policy, seed: 1, episodes: 1000 };
+        let recording = Recording { scenario: &*scenario, link: &*built, policy: &*policy, seed: 1, episodes: 1000 };
         let losses: Vec<f64> = returns(&recording, 0, 1000).iter().map(|e| e.loss_rate).collect();
         let mean = losses.iter().sum::<f64>() / 1000.0;
         let se = (losses.iter().map(|l| (l - mean).powi(2)).sum::<f64>() / 999.0 / 1000.0).sqrt();
