@@ -1,17 +1,15 @@
 //! `ccmarl record`: scenario × policy × link → a store.
 
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use serde_json::{Value, json};
+use serde_json::json;
 
+use super::args::{ScenarioArgs, stop_flag};
 use super::{Outcome, ui};
 use crate::link::{LINKS, Setting};
 use crate::record::{Options, POLICIES, RecordError, Recording, loss_rate};
 use crate::registry::{RegistryError, Spec};
-use crate::scenario::SCENARIOS;
 use crate::{Error, link, record, scenario, storage};
 
 const EXAMPLES: &str = "\
@@ -27,18 +25,14 @@ The same seed gives the same bytes for any number of threads. Interrupted (Ctrl-
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct Args {
-    /// Scenario: name or name:agents
-    #[arg(long)]
-    scenario: String,
-    /// Number of agents under policy control [default: the scenario's]
-    #[arg(long)]
-    agents: Option<u32>,
-    /// Scenario parameter, as often as needed: key=value
-    #[arg(long = "set", value_name = "KEY=VALUE")]
-    overrides: Vec<String>,
+    #[command(flatten)]
+    scenario: ScenarioArgs,
     /// Policy: name or name:value
     #[arg(long, default_value = "random")]
     policy: String,
+    /// Exploration noise of a trained policy (run:DIR): standard deviation
+    #[arg(long, value_name = "SIGMA")]
+    action_noise: Option<f64>,
     /// Link: name or name:value
     #[arg(long, default_value = "perfect")]
     link: String,
@@ -72,21 +66,25 @@ struct Summary {
 
 /// Runs the command.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
-    let scenario = scenario::build(&scenario_spec(args)?).map_err(Error::from)?;
+    let spec = args.scenario.spec(None)?.ok_or_else(|| RegistryError::Params {
+        name: "record".to_owned(),
+        message: "give --scenario NAME (`ccmarl list` shows all)".to_owned(),
+    });
+    let scenario = scenario::build(&spec.map_err(Error::from)?).map_err(Error::from)?;
     let link_spec = Spec::parse("link", LINKS, &args.link).map_err(Error::from)?;
     let setting = Setting { distance_unit: scenario.link_unit() };
     let link = link::build(&link_spec, &setting).map_err(Error::from)?;
-    let policy_spec = Spec::parse("policy", POLICIES, &args.policy).map_err(Error::from)?;
+    let mut policy_spec = Spec::parse("policy", POLICIES, &args.policy).map_err(Error::from)?;
+    if let Some(sigma) = args.action_noise {
+        policy_spec = policy_spec.with("action_noise", sigma);
+    }
     let policy = record::build_policy(&policy_spec, &*scenario).map_err(Error::from)?;
     let recording =
         Recording { scenario: &*scenario, link: &*link, policy: &*policy, seed: args.seed, episodes: args.episodes };
     if args.episodes == 0 {
         return Err(Error::from(RecordError::NoEpisodes).into());
     }
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = Arc::clone(&stop);
-    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed))?;
-
+    let stop = stop_flag()?;
     let mut sink = storage::create(&args.out, &recording.manifest(), args.force).map_err(Error::from)?;
     let communicators = recording.layout().communicators().len();
     let bar = ui::progress(args.episodes, "episodes");
@@ -117,23 +115,6 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         return Ok(Outcome::Interrupted);
     }
     Ok(Outcome::Done)
-}
-
-/// The scenario as named, with `--agents` and `--set`.
-fn scenario_spec(args: &Args) -> Result<Spec, Error> {
-    let mut spec = Spec::parse("scenario", SCENARIOS, &args.scenario)?;
-    if let Some(agents) = args.agents {
-        spec = spec.with("agents", agents);
-    }
-    for pair in &args.overrides {
-        let Some((key, value)) = pair.split_once('=') else {
-            let message = format!("--set takes key=value, found {pair:?}");
-            return Err(RegistryError::Params { name: spec.name, message }.into());
-        };
-        let value = serde_json::from_str::<Value>(value).unwrap_or_else(|_| Value::from(value));
-        spec = spec.with(key, value);
-    }
-    Ok(spec)
 }
 
 impl Summary {

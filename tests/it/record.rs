@@ -48,9 +48,10 @@ impl Parts {
     }
 }
 
-/// A valid use of every policy: extend this when a new policy needs a parameter.
-fn example(name: &str) -> String {
-    if name == "probe" { "probe:0.75".to_owned() } else { name.to_owned() }
+/// A valid use of every policy but `run`, which needs a trained run: extend this when a new one needs a parameter.
+fn examples() -> impl Iterator<Item = &'static str> {
+    let known = POLICIES.iter().map(|entry| if entry.name == "probe" { "probe:0.75" } else { entry.name });
+    known.filter(|&name| name != "run")
 }
 
 fn record(recording: &Recording<'_>, threads: usize, block: usize) -> Vec<Episode> {
@@ -67,9 +68,9 @@ fn record(recording: &Recording<'_>, threads: usize, block: usize) -> Vec<Episod
 
 #[test]
 fn every_policy_fills_every_scenario_and_its_parameters_build_it_again() {
-    for (scenario, policy) in SCENARIOS.iter().flat_map(|s| POLICIES.iter().map(move |p| (s, p))) {
+    for (scenario, policy) in SCENARIOS.iter().flat_map(|s| examples().map(move |p| (s, p))) {
         for agents in [1, 2, 4] {
-            let parts = Parts::new(scenario.name, agents, "dropout:0.5", &example(policy.name));
+            let parts = Parts::new(scenario.name, agents, "dropout:0.5", policy);
             let recording = parts.recording(1, 3);
             let episode = recording.episode(2);
             episode.check(&recording.layout()).unwrap();
