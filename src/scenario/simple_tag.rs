@@ -26,9 +26,9 @@
 //! 2512.03528.
 //!
 //! # Differences from the reference implementation
-//! Candidates are drawn by rejection from the square (there: radius and angle), at 32 bits per coordinate: the same
-//! distribution without trigonometry. One prey and two obstacles at every N, as PMIC has it. The prey's reward, which
-//! is never computed there, is 0.
+//! Candidates are drawn by rejection from the square (there: radius and angle), at 24 bits per coordinate, and scored in
+//! `f32`: the same distribution without trigonometry. One prey and two obstacles at every N, as PMIC has it. The prey's
+//! reward, which is never computed there, is 0.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
