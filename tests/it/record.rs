@@ -1,6 +1,7 @@
 //! Recording: contract over the policies, determinism, the command's refusals.
 #![expect(clippy::unwrap_used, reason = "helpers of tests")]
 
+use std::io::{BufRead as _, BufReader};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use assert_cmd::Command;
@@ -201,4 +202,60 @@ fn the_command_refuses_wrong_words_with_exit_code_2() {
         assert_eq!(code, 2, "{stderr}");
         assert!(stderr.contains(message) && stderr.lines().count() == 1, "{stderr}");
     }
+}
+
+fn ccmarl(arguments: &[&str], out: &std::path::Path) -> std::process::Output {
+    Command::cargo_bin("ccmarl").unwrap().arg("record").args(arguments).arg("--out").arg(out).output().unwrap()
+}
+
+/// All files of a store with their bytes.
+fn bytes(store: &std::path::Path) -> Vec<(String, Vec<u8>)> {
+    let mut files: Vec<_> = store.read_dir().unwrap().map(|f| f.unwrap().path()).collect();
+    files.sort();
+    files.into_iter().map(|f| (f.file_name().unwrap().to_string_lossy().into(), std::fs::read(f).unwrap())).collect()
+}
+
+#[test]
+fn the_command_writes_the_same_store_for_any_threads_and_refuses_to_replace_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let (one, eight) = (dir.path().join("one"), dir.path().join("eight"));
+    let arguments = ["--scenario", "simple_tag", "--link", "markov:heavy", "--episodes", "40", "--format", "json"];
+    let output = ccmarl(&[&arguments[..], &["--threads", "1"]].concat(), &one);
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success() && stderr.contains("committed 40 episodes"), "{stderr}");
+    let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!((&summary["episodes"], &summary["steps"]), (&Value::from(40), &Value::from(1000)));
+    assert_eq!(summary["link"]["matrix"][0][0], 0.9);
+    assert!(ccmarl(&[&arguments[..], &["--threads", "8"]].concat(), &eight).status.success());
+    assert_eq!(bytes(&one), bytes(&eight));
+
+    let again = ccmarl(&arguments, &one);
+    assert_eq!(again.status.code(), Some(2));
+    assert!(String::from_utf8(again.stderr).unwrap().starts_with("error: output exists: give --force"));
+    assert!(ccmarl(&[&arguments[..], &["--force", "--seed", "2"]].concat(), &one).status.success());
+    assert_ne!(bytes(&one), bytes(&eight));
+}
+
+#[test]
+fn an_interrupted_recording_is_sealed_and_exits_4() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = dir.path().join("store");
+    let mut child = std::process::Command::new(assert_cmd::cargo::cargo_bin("ccmarl"))
+        .args(["record", "--scenario", "simple_spread", "--episodes", "100000000", "--out"])
+        .arg(&store)
+        .stdout(std::process::Stdio::null())
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    let first = lines.next().unwrap().unwrap();
+    assert!(first.starts_with("committed "), "{first}");
+    assert!(std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+    let rest: Vec<String> = lines.map(Result::unwrap).collect();
+    assert_eq!(child.wait().unwrap().code(), Some(4), "{rest:?}");
+    assert!(rest.last().unwrap().starts_with("interrupted: sealed "), "{rest:?}");
+    let committed: u64 = rest[rest.len() - 2].split(' ').nth(1).unwrap().parse().unwrap();
+    let mut source = ccmarl::storage::open(&store).unwrap();
+    assert_eq!(source.manifest().episodes, committed);
+    assert_eq!(source.next_episode().unwrap().unwrap().index, 0);
 }
