@@ -194,7 +194,10 @@ fn the_command_refuses_wrong_words_with_exit_code_2() {
         (&["--scenario", "simple_tag", "--link", "dropout:2"], "dropout: p must be in [0, 1], found 2"),
         (&["--scenario", "simple_tag", "--agents", "0"], "simple_tag: agents must be in [1, 1000], found 0"),
         (&["--scenario", "simple_tag", "--set", "radius"], "--set takes key=value, found \"radius\""),
-        (&["--scenario", "simple_tag", "--set", "dt=nan"], "invalid type: string \"nan\", expected f64"),
+        (
+            &["--scenario", "simple_tag", "--set", "dt=nan"],
+            "simple_tag: dt: invalid type: string \"nan\", expected f64",
+        ),
         (&["--scenario", "simple_tag", "--episodes", "0"], "expected at least 1 episode, found 0"),
         (&["--scenario", "simple_tag", "--policy", "probe:1.5"], "probe: rho must be in [-1, 1], found 1.5"),
     ] {
