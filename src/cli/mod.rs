@@ -2,7 +2,9 @@
 #![expect(clippy::print_stdout, clippy::print_stderr, reason = "the face of the program prints")]
 
 mod args;
+mod evaluate;
 mod record;
+mod train;
 mod ui;
 
 use std::process::ExitCode;
@@ -23,6 +25,10 @@ pub struct Cli {
 enum Command {
     /// Record episodes of a scenario under a policy and a link
     Record(record::Args),
+    /// Train a team over a link prior
+    Train(train::Args),
+    /// Test a trained team on every channel of a suite
+    Evaluate(evaluate::Args),
 }
 
 /// How a command ended, when it did not fail.
@@ -57,5 +63,7 @@ pub fn main() -> ExitCode {
 fn dispatch(command: Command) -> anyhow::Result<Outcome> {
     match command {
         Command::Record(args) => record::run(&args),
+        Command::Train(args) => train::run(&args),
+        Command::Evaluate(args) => evaluate::run(&args),
     }
 }

@@ -17,6 +17,7 @@ const EXAMPLES: &str = "\
 Examples:
   ccmarl record --scenario simple_tag --agents 3 --policy random --link dropout:0.2 --episodes 1000 --seed 1 --out data/tag
   ccmarl record --scenario simple_spread --agents 2 --policy probe:0.75 --link markov:heavy --out data/probe.parquet
+  ccmarl record --scenario simple_spread --policy run:runs/x --action-noise 0.3 --link dropout:0.2 --out data/x
   ccmarl record --scenario simple_spread --policy scripted --link distance:3 --set view_radius=0.5 --out data/spread.mcap
 
 The same seed gives the same bytes for any number of threads. Interrupted (Ctrl-C), it seals what is done and exits 4.
@@ -102,7 +103,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         }
     };
     let options = Options { threads: args.threads, block: 0 };
-    let recorded = recording.record(&mut *sink, options, &mut committed, &stop).map_err(Error::from)?;
+    let recorded = recording.record(&mut *sink, options, &mut committed, stop).map_err(Error::from)?;
     bar.finish_and_clear();
     if recorded.episodes == 0 {
         ui::say("interrupted before the first episode: nothing was written");
