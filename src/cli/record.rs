@@ -9,7 +9,8 @@ use super::args::{ScenarioArgs, stop_flag};
 use super::{Outcome, ui};
 use crate::link::{LINKS, Setting};
 use crate::record::{Options, POLICIES, RecordError, Recording, loss_rate};
-use crate::registry::Spec;
+use crate::registry::{RegistryError, Spec};
+use crate::schema::Episode;
 use crate::{Error, link, record, scenario, storage};
 
 const EXAMPLES: &str = "\
@@ -31,7 +32,7 @@ pub(super) struct Args {
     /// Policy: name or name:value
     #[arg(long, default_value = "random")]
     policy: String,
-    /// Standard deviation of normal noise on a trained policy's actions
+    /// Exploration noise of a trained policy (run:DIR): standard deviation
     #[arg(long, value_name = "SIGMA")]
     action_noise: Option<f64>,
     /// Link: name or name:value
@@ -60,17 +61,21 @@ pub(super) struct Args {
 /// Running mean and standard deviation of returns, and the mean loss rate.
 #[derive(Default)]
 struct Summary {
+    episodes: u64,
     steps: usize,
-    returns: Vec<f64>,
+    mean: f64,
+    /// Sum of squared deviations from the mean (Welford).
+    squares: f64,
     losses: f64,
 }
 
 /// Runs the command.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
-    let Some(spec) = args.scenario.spec(None)? else {
-        anyhow::bail!("give a --scenario (`ccmarl list scenarios` shows them)");
-    };
-    let scenario = scenario::build(&spec).map_err(Error::from)?;
+    let spec = args.scenario.spec(None)?.ok_or_else(|| RegistryError::Params {
+        name: "record".to_owned(),
+        message: "give --scenario NAME (`ccmarl list` shows all)".to_owned(),
+    });
+    let scenario = scenario::build(&spec.map_err(Error::from)?).map_err(Error::from)?;
     let link_spec = Spec::parse("link", LINKS, &args.link).map_err(Error::from)?;
     let setting = Setting { distance_unit: scenario.link_unit() };
     let link = link::build(&link_spec, &setting).map_err(Error::from)?;
@@ -79,26 +84,18 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         policy_spec = policy_spec.with("action_noise", sigma);
     }
     let policy = record::build_policy(&policy_spec, &*scenario).map_err(Error::from)?;
-    let recording = Recording {
-        scenario: &*scenario,
-        link: &*link,
-        policy: &*policy,
-        seed: args.seed,
-        episodes: args.episodes,
-    };
+    let recording =
+        Recording { scenario: &*scenario, link: &*link, policy: &*policy, seed: args.seed, episodes: args.episodes };
     if args.episodes == 0 {
         return Err(Error::from(RecordError::NoEpisodes).into());
     }
     let stop = stop_flag()?;
-
     let mut sink = storage::create(&args.out, &recording.manifest(), args.force).map_err(Error::from)?;
     let communicators = recording.layout().communicators().len();
     let bar = ui::progress(args.episodes, "episodes");
     let (mut summary, mut said) = (Summary::default(), Instant::now());
-    let mut committed = |episode: &crate::schema::Episode| {
-        summary.steps += episode.steps;
-        summary.returns.push(episode.episode_return());
-        summary.losses += loss_rate(episode, communicators);
+    let mut committed = |episode: &Episode| {
+        summary.add(episode, loss_rate(episode, communicators));
         bar.inc(1);
         if said.elapsed() > Duration::from_millis(900) {
             said = Instant::now();
@@ -124,24 +121,30 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
 }
 
 impl Summary {
+    fn add(&mut self, episode: &Episode, loss_rate: f64) {
+        self.episodes += 1;
+        self.steps += episode.steps;
+        let deviation = episode.episode_return() - self.mean;
+        self.mean += deviation / self.episodes as f64;
+        self.squares += deviation * (episode.episode_return() - self.mean);
+        self.losses += loss_rate;
+    }
+
     fn print(&self, args: &Args, recording: &Recording<'_>) -> anyhow::Result<()> {
-        let n = self.returns.len() as f64;
-        let mean = self.returns.iter().sum::<f64>() / n;
-        let squares = self.returns.iter().map(|r| (r - mean) * (r - mean)).sum::<f64>();
-        let std = (squares / (n - 1.0).max(1.0)).sqrt();
-        let loss = self.losses / n;
+        let n = self.episodes as f64;
+        let (mean, std, loss) = (self.mean, (self.squares / (n - 1.0).max(1.0)).sqrt(), self.losses / n);
         let out = args.out.display().to_string();
         let manifest = recording.manifest();
         match args.format {
             ui::Format::Json => ui::print_json(&json!({
-                "out": out, "episodes": self.returns.len(), "steps": self.steps, "seed": args.seed,
+                "out": out, "episodes": self.episodes, "steps": self.steps, "seed": args.seed,
                 "scenario": manifest.scenario, "link": manifest.link, "policy": manifest.policy,
                 "return_mean": mean, "return_std": std, "loss_rate": loss,
             })),
             ui::Format::Table => {
                 let rows = [
                     ("store", out),
-                    ("episodes", self.returns.len().to_string()),
+                    ("episodes", self.episodes.to_string()),
                     ("steps", self.steps.to_string()),
                     ("return", format!("{mean:.2} ± {std:.2} (std over episodes)")),
                     ("return counts", recording.scenario.reward_convention().to_owned()),

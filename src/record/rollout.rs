@@ -32,7 +32,7 @@ pub struct Recording<'a> {
 pub struct Options {
     /// Threads; 0 is one per core.
     pub threads: usize,
-    /// Episodes computed at once; 0 chooses by their size. At most three blocks are in memory.
+    /// Episodes computed at once; 0 chooses by their size. At most two blocks are in memory.
     pub block: usize,
 }
 
@@ -148,7 +148,7 @@ impl Recording<'_> {
         let block = if options.block == 0 { default_block(&layout, self.scenario.steps()) } else { options.block };
         let mut done = 0;
         std::thread::scope(|scope| {
-            let (send, receive) = sync_channel::<Vec<Episode>>(1);
+            let (send, receive) = sync_channel::<Vec<Episode>>(0);
             let (layout, pool) = (&layout, &pool);
             scope.spawn(move || {
                 let mut next = 0;
