@@ -14,7 +14,14 @@ use clap::{Parser, Subcommand};
 
 /// Record, measure, train and compare agents that talk over unreliable links.
 #[derive(Debug, Parser)]
-#[command(name = "ccmarl", version, about, propagate_version = true, arg_required_else_help = true, max_term_width = 100)]
+#[command(
+    name = "ccmarl",
+    version,
+    about,
+    propagate_version = true,
+    arg_required_else_help = true,
+    max_term_width = 100
+)]
 pub struct Cli {
     /// What to do
     #[command(subcommand)]
