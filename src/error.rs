@@ -1,6 +1,8 @@
 //! The crate's error: one enum per room, wrapped here, and the exit code each deserves.
 
 use crate::io::IoError;
+use crate::mi::MiError;
+use crate::pairs::PairsError;
 use crate::record::RecordError;
 use crate::registry::RegistryError;
 use crate::schema::SchemaError;
@@ -15,6 +17,12 @@ pub enum Error {
     /// A plugin's name or parameters.
     #[error(transparent)]
     Registry(#[from] RegistryError),
+    /// Samples from a store or a table.
+    #[error(transparent)]
+    Pairs(#[from] PairsError),
+    /// Samples that cannot carry an estimate.
+    #[error(transparent)]
+    Mi(#[from] MiError),
     /// Recording.
     #[error(transparent)]
     Record(#[from] RecordError),
@@ -32,6 +40,7 @@ impl Error {
         match self {
             Self::Registry(_) | Self::Io(IoError::Exists(_)) | Self::Record(RecordError::NoEpisodes) => true,
             Self::Storage(StorageError::Io(IoError::Exists(_))) => true,
+            Self::Pairs(error) => error.is_usage(),
             _ => false,
         }
     }

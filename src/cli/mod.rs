@@ -1,6 +1,7 @@
 //! The command line: one file per subcommand. The only place for anyhow, printing, progress bars and tables.
 #![expect(clippy::print_stdout, clippy::print_stderr, reason = "the face of the program prints")]
 
+mod estimate_mi;
 mod record;
 mod ui;
 
@@ -10,7 +11,14 @@ use clap::{Parser, Subcommand};
 
 /// Record, measure, train and compare agents that talk over unreliable links.
 #[derive(Debug, Parser)]
-#[command(name = "ccmarl", version, about, propagate_version = true, arg_required_else_help = true, max_term_width = 100)]
+#[command(
+    name = "ccmarl",
+    version,
+    about,
+    propagate_version = true,
+    arg_required_else_help = true,
+    max_term_width = 100
+)]
 pub struct Cli {
     /// What to do
     #[command(subcommand)]
@@ -20,6 +28,8 @@ pub struct Cli {
 /// The subcommands.
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Estimate how much messages and actions, or any columns, tell about each other
+    EstimateMi(estimate_mi::Args),
     /// Record episodes of a scenario under a policy and a link
     Record(record::Args),
 }
@@ -55,6 +65,7 @@ pub fn main() -> ExitCode {
 
 fn dispatch(command: Command) -> anyhow::Result<Outcome> {
     match command {
+        Command::EstimateMi(args) => estimate_mi::run(&args),
         Command::Record(args) => record::run(&args),
     }
 }
