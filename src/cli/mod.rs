@@ -1,6 +1,8 @@
 //! The command line: one file per subcommand. The only place for anyhow, printing, progress bars and tables.
 #![expect(clippy::print_stdout, clippy::print_stderr, reason = "the face of the program prints")]
 
+mod generate;
+mod list;
 mod ui;
 
 use std::process::ExitCode;
@@ -18,7 +20,12 @@ pub struct Cli {
 
 /// The subcommands.
 #[derive(Debug, Subcommand)]
-enum Command {}
+enum Command {
+    /// List what can be named on the command line: scenarios, links, policies, estimators, algorithms, …
+    List(list::Args),
+    /// Generate shell completions or manual pages
+    Generate(generate::Args),
+}
 
 /// How a command ended, when it did not fail.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -50,5 +57,8 @@ pub fn main() -> ExitCode {
 }
 
 fn dispatch(command: Command) -> anyhow::Result<Outcome> {
-    match command {}
+    match command {
+        Command::List(args) => list::run(&args),
+        Command::Generate(args) => generate::run(&args),
+    }
 }

@@ -218,14 +218,19 @@ fn import_faults(sources: &[Source]) -> Vec<String> {
     for source in sources {
         let room = source.room();
         if floor(room).is_none() {
-            faults.push(format!("src/{}: room {room} has no floor: add it to FLOORS and to ARCHITECTURE.md", source.path));
+            faults.push(format!(
+                "src/{}: room {room} has no floor: add it to FLOORS and to ARCHITECTURE.md",
+                source.path
+            ));
         }
         for (line, name) in crate_paths(&source.code) {
             // `crate::Error` is re-exported at the root
             let other = if name == "Error" { "error" } else { name.as_str() };
             if !may_import(room, other) {
                 let path = &source.path;
-                faults.push(format!("src/{path}:{line}: {room} must not import crate::{name}: only rooms on floors below"));
+                faults.push(format!(
+                    "src/{path}:{line}: {room} must not import crate::{name}: only rooms on floors below"
+                ));
             }
         }
     }
@@ -237,7 +242,8 @@ fn crate_uses(code: &str, name: &str) -> Vec<usize> {
     let mut lines = Vec::new();
     for (start, _) in code.match_indices(name) {
         let (before, after) = (&code[..start], &code[start + name.len()..]);
-        let own_path = before.strip_suffix("::").is_some_and(|b| b.ends_with(|c: char| c.is_alphanumeric() || c == '>'));
+        let own_path =
+            before.strip_suffix("::").is_some_and(|b| b.ends_with(|c: char| c.is_alphanumeric() || c == '>'));
         let whole = !before.ends_with(|c: char| c.is_alphanumeric() || c == '_') && !own_path;
         let used = after.starts_with("::") || after.starts_with('!');
         if whole && (used || before.ends_with("use ")) {
@@ -299,7 +305,8 @@ fn plugin_faults(sources: &[Source]) -> Vec<String> {
         for plugin in &plugins {
             let (path, module) = (&plugin.path, plugin.module());
             if !listed.iter().any(|name| name == module) {
-                faults.push(format!("src/{path}: not listed: add `{module}::ENTRY,` to the slice in src/{room}/mod.rs"));
+                faults
+                    .push(format!("src/{path}: not listed: add `{module}::ENTRY,` to the slice in src/{room}/mod.rs"));
             }
             let found = headings(&plugin.text);
             if found != HEADINGS {
@@ -309,7 +316,9 @@ fn plugin_faults(sources: &[Source]) -> Vec<String> {
             }
         }
         for name in listed.iter().filter(|name| !plugins.iter().any(|p| p.module() == **name)) {
-            faults.push(format!("src/{room}/mod.rs: lists {name}::ENTRY, but src/{room}/{name}.rs has no `const ENTRY:`"));
+            faults.push(format!(
+                "src/{room}/mod.rs: lists {name}::ENTRY, but src/{room}/{name}.rs has no `const ENTRY:`"
+            ));
         }
     }
     faults
@@ -368,7 +377,10 @@ fn the_scanner_sees_wrong_imports_and_only_those() {
     );
     let right = [
         Source::new("mi/mod.rs", "use crate::pairs::Pairs;\nuse crate::{Error, nn::{Adam, Mlp}, stats};\n"),
-        Source::new("io.rs", "use crate::schema::hex;\n/// [`crate::cli`]\n// crate::cli\nconst S: &str = \"crate::cli\";\n"),
+        Source::new(
+            "io.rs",
+            "use crate::schema::hex;\n/// [`crate::cli`]\n// crate::cli\nconst S: &str = \"crate::cli\";\n",
+        ),
         Source::new("error.rs", "use crate::train::TrainError;\n"),
         Source::new("rng.rs", "#[cfg(test)]\nmod tests {\n    use crate::cli;\n    fn f() { if true {} }\n}\n"),
     ];
@@ -396,7 +408,10 @@ fn the_scanner_sees_crates_and_words_out_of_place() {
     );
     let right = [
         Source::new("cli/list.rs", "println!(\"{}\", crate::storage::mcap::NAME);\n"),
-        Source::new("pairs.rs", "let p = format!(\"{x}.parquet\"); let c = '\"'; // mcap::read\nf(r#\"a \"plotters::b\"#);\n"),
+        Source::new(
+            "pairs.rs",
+            "let p = format!(\"{x}.parquet\"); let c = '\"'; // mcap::read\nf(r#\"a \"plotters::b\"#);\n",
+        ),
         Source::new("storage/mcap.rs", "use mcap::Writer;\n#[expect(lint, reason = \"x\")]\nfn f<'a>(x: &'a str) {}\n"),
     ];
     assert_eq!(border_faults(&right), [""; 0]);
