@@ -136,7 +136,8 @@ fn without_literals(text: &str) -> String {
             out.push_str("\"\"");
             i = skip(&mut out, i, end + 1);
         } else if at(i) == '\'' && (at(i + 1) == '\\' || at(i + 2) == '\'') {
-            i = (i + 3..chars.len()).find(|&k| at(k - 1) == '\'').unwrap_or(chars.len());
+            let first_end = if at(i + 1) == '\\' { i + 4 } else { i + 3 };
+            i = (first_end..=chars.len()).find(|&k| at(k - 1) == '\'').unwrap_or(chars.len());
             out.push_str("' '");
         } else {
             out.push(at(i));
@@ -410,7 +411,7 @@ fn the_scanner_sees_crates_and_words_out_of_place() {
         Source::new("cli/list.rs", "println!(\"{}\", crate::storage::mcap::NAME);\n"),
         Source::new(
             "pairs.rs",
-            "let p = format!(\"{x}.parquet\"); let c = '\"'; // mcap::read\nf(r#\"a \"plotters::b\"#);\n",
+            "let p = format!(\"{x}.parquet\"); let c = ['\"', '\\'']; // mcap::read\nf(r#\"a \"plotters::b\"#);\n",
         ),
         Source::new("storage/mcap.rs", "use mcap::Writer;\n#[expect(lint, reason = \"x\")]\nfn f<'a>(x: &'a str) {}\n"),
     ];
