@@ -3,6 +3,8 @@
 
 mod estimate_mi;
 mod record;
+mod generate;
+mod list;
 mod ui;
 
 use std::process::ExitCode;
@@ -32,6 +34,10 @@ enum Command {
     EstimateMi(estimate_mi::Args),
     /// Record episodes of a scenario under a policy and a link
     Record(record::Args),
+    /// List what can be named on the command line: scenarios, links, policies, estimators, algorithms, …
+    List(list::Args),
+    /// Generate shell completions or manual pages
+    Generate(generate::Args),
 }
 
 /// How a command ended, when it did not fail.
@@ -67,5 +73,7 @@ fn dispatch(command: Command) -> anyhow::Result<Outcome> {
     match command {
         Command::EstimateMi(args) => estimate_mi::run(&args),
         Command::Record(args) => record::run(&args),
+        Command::List(args) => list::run(&args),
+        Command::Generate(args) => generate::run(&args),
     }
 }

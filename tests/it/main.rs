@@ -1,5 +1,6 @@
 //! The one integration binary.
 
-mod links;
-mod record;
-mod worlds;
+mod architecture;
+mod cli;
+mod estimate_mi;
+mod mi;
