@@ -179,6 +179,12 @@ fn place(labels: &SampleLabels) -> String {
     }
 }
 
+/// Four decimals, and no minus sign before a zero.
+fn decimals(value: f64) -> String {
+    let text = format!("{value:.4}");
+    if text == "-0.0000" { "0.0000".to_owned() } else { text }
+}
+
 fn print(rows: &[Estimate], samples: &[Samples]) -> anyhow::Result<()> {
     let mut warnings: BTreeMap<&str, Vec<String>> = BTreeMap::new();
     let mut lines = Vec::new();
@@ -196,14 +202,17 @@ fn print(rows: &[Estimate], samples: &[Samples]) -> anyhow::Result<()> {
             Kind::UpperBound => "≤ ",
             Kind::Estimate => "",
         };
-        let value =
-            if row.value.is_infinite() { "infinite (copy)".to_owned() } else { format!("{sign}{:.4}", row.value) };
+        let value = if row.value.is_infinite() {
+            "infinite (copy)".to_owned()
+        } else {
+            format!("{sign}{}", decimals(row.value))
+        };
         let interval = row.interval_low.zip(row.interval_high);
         lines.push(vec![
             if here == before { String::new() } else { here.clone() },
             row.estimator.clone(),
             value,
-            interval.map_or_else(String::new, |(low, high)| format!("{low:.4} … {high:.4}")),
+            interval.map_or_else(String::new, |(low, high)| format!("{} … {}", decimals(low), decimals(high))),
             match row.unit {
                 Unit::Nats => "nats".to_owned(),
                 Unit::Jsd => "jsd".to_owned(),

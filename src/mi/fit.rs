@@ -1,7 +1,7 @@
 //! Training of an estimator's networks: Adam on minibatches, stopped on validation.
 
 use super::prepare::{Prepared, gather};
-use crate::nn::{Adam, AdamConfig, clip_norm};
+use crate::nn::{Adam, AdamConfig, Mlp, clip_norm};
 use crate::rng::{self, Seeds, Stream};
 
 const BATCH: usize = 256;
@@ -16,7 +16,10 @@ const LOOK: usize = 4096;
 
 /// What is trained.
 pub(super) trait Model {
-    /// Fresh parameters.
+    /// Decoupled weight decay per unit of learning rate: more helps small samples and hurts strong dependence.
+    const DECAY: f32;
+
+    /// Fresh parameters, at which the score is that of "x tells nothing".
     fn init(&self, rng: &mut Stream) -> Vec<f32>;
 
     /// Loss on a minibatch of `n` pairs; adds its gradient to `grads`.
@@ -26,15 +29,23 @@ pub(super) trait Model {
     fn score(&mut self, params: &[f32], x: &[f32], y: &[f32], n: usize, rng: &mut Stream) -> f64;
 }
 
-/// The best parameters, and how they score on the validation part.
+/// The parameters that scored best on the validation part.
 pub(super) struct Fit {
     pub(super) params: Vec<f32>,
-    pub(super) score: f64,
+    score: f64,
+    /// Steps after which they were reached; 0: nothing was learnt that holds on the validation part.
+    pub(super) steps: usize,
+}
+
+/// Zeroes the last layer of `mlp`, whose parameters are `params`: its output is 0 for every input.
+pub(super) fn silence(mlp: &Mlp, params: &mut [f32]) {
+    let (_, last) = mlp.weight(mlp.layers() - 1);
+    params[last..mlp.parameters()].fill(0.0);
 }
 
 /// Trains on the training part and keeps the parameters that score best on the validation part; `None` when no score
 /// was finite.
-pub(super) fn fit(model: &mut impl Model, data: &Prepared, seeds: &Seeds) -> Option<Fit> {
+pub(super) fn fit<M: Model>(model: &mut M, data: &Prepared, seeds: &Seeds) -> Option<Fit> {
     let mut params = model.init(&mut seeds.stream("init"));
     let mut adam = Adam::new(AdamConfig::new(LEARNING_RATE), params.len());
     let (mut order_rng, mut loss_rng) = (seeds.stream("order"), seeds.stream("negatives"));
@@ -47,7 +58,19 @@ pub(super) fn fit(model: &mut impl Model, data: &Prepared, seeds: &Seeds) -> Opt
     let mut grads = vec![0.0; params.len()];
     let mut best: Option<Fit> = None;
     let mut waited = 0;
-    for step in 1..=STEPS {
+    for step in 0..=STEPS {
+        if step % EVERY == 0 {
+            let score = model.score(&params, &vx, &vy, looked.len(), &mut seeds.stream("validation"));
+            if score.is_finite() && best.as_ref().is_none_or(|b| score > b.score) {
+                best = Some(Fit { params: params.clone(), score, steps: step });
+                waited = 0;
+            } else {
+                waited += 1;
+            }
+            if waited == PATIENCE {
+                break;
+            }
+        }
         if order.len() < batch {
             order = rng::permutation(&mut order_rng, data.train.len());
         }
@@ -59,20 +82,10 @@ pub(super) fn fit(model: &mut impl Model, data: &Prepared, seeds: &Seeds) -> Opt
         model.loss(&params, &x, &y, batch, &mut loss_rng, &mut grads);
         clip_norm(&mut grads, 5.0);
         // linear decay to zero: the last steps average out the noise of the minibatches
-        adam.config.learning_rate = LEARNING_RATE * (1.0 - (step - 1) as f32 / STEPS as f32);
+        let rate = LEARNING_RATE * (1.0 - step as f32 / STEPS as f32);
+        adam.config.learning_rate = rate;
         adam.step(&mut params, &grads);
-        if step % EVERY == 0 {
-            let score = model.score(&params, &vx, &vy, looked.len(), &mut seeds.stream("validation"));
-            if score.is_finite() && best.as_ref().is_none_or(|b| score > b.score) {
-                best = Some(Fit { params: params.clone(), score });
-                waited = 0;
-            } else {
-                waited += 1;
-            }
-            if waited == PATIENCE {
-                break;
-            }
-        }
+        params.iter_mut().for_each(|p| *p *= 1.0 - rate * M::DECAY);
     }
     best
 }
