@@ -8,7 +8,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use polars::prelude::{
-    Column, CsvReadOptions, DataFrame, DataType, ParquetReader, PolarsResult, Schema, SerReader as _,
+    Column, CsvReadOptions, DataFrame, DataType, ParquetReader, PolarsResult, SerReader as _,
 };
 
 use super::PairsError;
@@ -167,7 +167,7 @@ fn read(path: &Path, wanted: &[&str]) -> Result<DataFrame, PairsError> {
         let file = open()?;
         guarded(form, path, || {
             let schema = ParquetReader::new(file).schema()?;
-            Ok(Schema::from_arrow_schema(&schema).iter_names().map(ToString::to_string).collect())
+            Ok(schema.iter_names().map(ToString::to_string).collect())
         })?
     } else {
         let options = CsvReadOptions::default().with_n_rows(Some(0)).with_infer_schema_length(Some(0));
