@@ -5,6 +5,10 @@ mod estimate_mi;
 mod record;
 mod generate;
 mod list;
+mod args;
+mod evaluate;
+mod record;
+mod train;
 mod ui;
 
 use std::process::ExitCode;
@@ -38,6 +42,10 @@ enum Command {
     List(list::Args),
     /// Generate shell completions or manual pages
     Generate(generate::Args),
+    /// Train a team over a link prior
+    Train(train::Args),
+    /// Test a trained team on every channel of a suite
+    Evaluate(evaluate::Args),
 }
 
 /// How a command ended, when it did not fail.
@@ -75,5 +83,7 @@ fn dispatch(command: Command) -> anyhow::Result<Outcome> {
         Command::Record(args) => record::run(&args),
         Command::List(args) => list::run(&args),
         Command::Generate(args) => generate::run(&args),
+        Command::Train(args) => train::run(&args),
+        Command::Evaluate(args) => evaluate::run(&args),
     }
 }

@@ -1,23 +1,22 @@
 //! `ccmarl record`: scenario × policy × link → a store.
 
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use serde_json::{Value, json};
+use serde_json::json;
 
+use super::args::{ScenarioArgs, stop_flag};
 use super::{Outcome, ui};
 use crate::link::{LINKS, Setting};
 use crate::record::{Options, POLICIES, RecordError, Recording, loss_rate};
-use crate::registry::{RegistryError, Spec};
-use crate::scenario::SCENARIOS;
+use crate::registry::Spec;
 use crate::{Error, link, record, scenario, storage};
 
 const EXAMPLES: &str = "\
 Examples:
   ccmarl record --scenario simple_tag --agents 3 --policy random --link dropout:0.2 --episodes 1000 --seed 1 --out data/tag
   ccmarl record --scenario simple_spread --agents 2 --policy probe:0.75 --link markov:heavy --out data/probe.parquet
+  ccmarl record --scenario simple_spread --policy run:runs/x --action-noise 0.3 --link dropout:0.2 --out data/x
   ccmarl record --scenario simple_spread --policy scripted --link distance:3 --set view_radius=0.5 --out data/spread.mcap
 
 The same seed gives the same bytes for any number of threads. Interrupted (Ctrl-C), it seals what is done and exits 4.
@@ -27,18 +26,14 @@ The same seed gives the same bytes for any number of threads. Interrupted (Ctrl-
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct Args {
-    /// Scenario: name or name:agents
-    #[arg(long)]
-    scenario: String,
-    /// Number of agents under policy control [default: the scenario's]
-    #[arg(long)]
-    agents: Option<u32>,
-    /// Scenario parameter, as often as needed: key=value
-    #[arg(long = "set", value_name = "KEY=VALUE")]
-    overrides: Vec<String>,
+    #[command(flatten)]
+    scenario: ScenarioArgs,
     /// Policy: name or name:value
     #[arg(long, default_value = "random")]
     policy: String,
+    /// Standard deviation of normal noise on a trained policy's actions
+    #[arg(long, value_name = "SIGMA")]
+    action_noise: Option<f64>,
     /// Link: name or name:value
     #[arg(long, default_value = "perfect")]
     link: String,
@@ -72,11 +67,17 @@ struct Summary {
 
 /// Runs the command.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
-    let scenario = scenario::build(&scenario_spec(args)?).map_err(Error::from)?;
+    let Some(spec) = args.scenario.spec(None)? else {
+        anyhow::bail!("give a --scenario (`ccmarl list scenarios` shows them)");
+    };
+    let scenario = scenario::build(&spec).map_err(Error::from)?;
     let link_spec = Spec::parse("link", LINKS, &args.link).map_err(Error::from)?;
     let setting = Setting { distance_unit: scenario.link_unit() };
     let link = link::build(&link_spec, &setting).map_err(Error::from)?;
-    let policy_spec = Spec::parse("policy", POLICIES, &args.policy).map_err(Error::from)?;
+    let mut policy_spec = Spec::parse("policy", POLICIES, &args.policy).map_err(Error::from)?;
+    if let Some(sigma) = args.action_noise {
+        policy_spec = policy_spec.with("action_noise", sigma);
+    }
     let policy = record::build_policy(&policy_spec, &*scenario).map_err(Error::from)?;
     let recording = Recording {
         scenario: &*scenario,
@@ -88,9 +89,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if args.episodes == 0 {
         return Err(Error::from(RecordError::NoEpisodes).into());
     }
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = Arc::clone(&stop);
-    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed))?;
+    let stop = stop_flag()?;
 
     let mut sink = storage::create(&args.out, &recording.manifest(), args.force).map_err(Error::from)?;
     let communicators = recording.layout().communicators().len();
@@ -107,7 +106,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         }
     };
     let options = Options { threads: args.threads, block: 0 };
-    let recorded = recording.record(&mut *sink, options, &mut committed, &stop).map_err(Error::from)?;
+    let recorded = recording.record(&mut *sink, options, &mut committed, stop).map_err(Error::from)?;
     bar.finish_and_clear();
     if recorded.episodes == 0 {
         ui::say("interrupted before the first episode: nothing was written");
@@ -122,23 +121,6 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         return Ok(Outcome::Interrupted);
     }
     Ok(Outcome::Done)
-}
-
-/// The scenario as named, with `--agents` and `--set`.
-fn scenario_spec(args: &Args) -> Result<Spec, Error> {
-    let mut spec = Spec::parse("scenario", SCENARIOS, &args.scenario)?;
-    if let Some(agents) = args.agents {
-        spec = spec.with("agents", agents);
-    }
-    for pair in &args.overrides {
-        let Some((key, value)) = pair.split_once('=') else {
-            let message = format!("--set takes key=value, found {pair:?}");
-            return Err(RegistryError::Params { name: spec.name, message }.into());
-        };
-        let value = serde_json::from_str::<Value>(value).unwrap_or_else(|_| Value::from(value));
-        spec = spec.with(key, value);
-    }
-    Ok(spec)
 }
 
 impl Summary {
