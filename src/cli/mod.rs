@@ -7,8 +7,8 @@ mod generate;
 mod list;
 mod args;
 mod evaluate;
-mod record;
 mod train;
+mod inspect;
 mod ui;
 
 use std::process::ExitCode;
@@ -46,6 +46,7 @@ enum Command {
     Train(train::Args),
     /// Test a trained team on every channel of a suite
     Evaluate(evaluate::Args),
+    Inspect(inspect::Args),
 }
 
 /// How a command ended, when it did not fail.
@@ -85,5 +86,6 @@ fn dispatch(command: Command) -> anyhow::Result<Outcome> {
         Command::Generate(args) => generate::run(&args),
         Command::Train(args) => train::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
+        Command::Inspect(args) => inspect::run(&args),
     }
 }
