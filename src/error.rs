@@ -1,6 +1,8 @@
 //! The crate's error: one enum per room, wrapped here, and the exit code each deserves.
 
 use crate::io::IoError;
+use crate::mi::MiError;
+use crate::pairs::PairsError;
 use crate::record::RecordError;
 use crate::registry::RegistryError;
 use crate::schema::SchemaError;
@@ -16,6 +18,12 @@ pub enum Error {
     /// A plugin's name or parameters.
     #[error(transparent)]
     Registry(#[from] RegistryError),
+    /// Samples from a store or a table.
+    #[error(transparent)]
+    Pairs(#[from] PairsError),
+    /// Samples that cannot carry an estimate.
+    #[error(transparent)]
+    Mi(#[from] MiError),
     /// Recording.
     #[error(transparent)]
     Record(#[from] RecordError),
@@ -35,6 +43,7 @@ impl Error {
     pub fn is_usage(&self) -> bool {
         let exists = |e: &IoError| matches!(e, IoError::Exists(_));
         match self {
+            Self::Pairs(error) => error.is_usage(),
             Self::Registry(_) | Self::Record(RecordError::NoEpisodes) => true,
             Self::Train(TrainError::Registry(_) | TrainError::Config { .. } | TrainError::Value { .. }) => true,
             Self::Io(e) | Self::Storage(StorageError::Io(e)) | Self::Train(TrainError::Io(e)) => exists(e),
