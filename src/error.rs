@@ -2,6 +2,7 @@
 
 use crate::io::IoError;
 use crate::registry::RegistryError;
+use crate::report::ReportError;
 use crate::schema::SchemaError;
 use crate::storage::StorageError;
 
@@ -20,11 +21,18 @@ pub enum Error {
     /// A store.
     #[error(transparent)]
     Storage(#[from] StorageError),
+    /// A report.
+    #[error(transparent)]
+    Report(#[from] ReportError),
 }
 
 impl Error {
     /// Whether the user's words are at fault (exit code 2), not the data or the machine (exit code 1).
     pub fn is_usage(&self) -> bool {
-        matches!(self, Self::Registry(_) | Self::Io(IoError::Exists(_)))
+        let report = matches!(
+            self,
+            Self::Report(ReportError::Io(IoError::Exists(_)) | ReportError::NoInput)
+        );
+        report || matches!(self, Self::Registry(_) | Self::Io(IoError::Exists(_)))
     }
 }

@@ -1,6 +1,11 @@
 //! The command line: one file per subcommand. The only place for anyhow, printing, progress bars and tables.
-#![expect(clippy::print_stdout, clippy::print_stderr, reason = "the face of the program prints")]
+#![expect(
+    clippy::print_stdout,
+    clippy::print_stderr,
+    reason = "the face of the program prints"
+)]
 
+mod report;
 mod ui;
 
 use std::process::ExitCode;
@@ -9,7 +14,14 @@ use clap::{Parser, Subcommand};
 
 /// Record, measure, train and compare agents that talk over unreliable links.
 #[derive(Debug, Parser)]
-#[command(name = "ccmarl", version, about, propagate_version = true, arg_required_else_help = true, max_term_width = 100)]
+#[command(
+    name = "ccmarl",
+    version,
+    about,
+    propagate_version = true,
+    arg_required_else_help = true,
+    max_term_width = 100
+)]
 pub struct Cli {
     /// What to do
     #[command(subcommand)]
@@ -18,7 +30,10 @@ pub struct Cli {
 
 /// The subcommands.
 #[derive(Debug, Subcommand)]
-enum Command {}
+enum Command {
+    /// Tables, figures and one self-contained page from run directories
+    Report(report::ReportArgs),
+}
 
 /// How a command ended, when it did not fail.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,7 +53,11 @@ pub fn main() -> ExitCode {
         Ok(cli) => cli,
         Err(error) => {
             let code = u8::try_from(error.exit_code()).unwrap_or(2);
-            return if error.print().is_ok() { ExitCode::from(code) } else { ExitCode::SUCCESS };
+            return if error.print().is_ok() {
+                ExitCode::from(code)
+            } else {
+                ExitCode::SUCCESS
+            };
         }
     };
     match dispatch(cli.command) {
@@ -50,5 +69,7 @@ pub fn main() -> ExitCode {
 }
 
 fn dispatch(command: Command) -> anyhow::Result<Outcome> {
-    match command {}
+    match command {
+        Command::Report(args) => report::run(&args),
+    }
 }

@@ -16,7 +16,10 @@ pub type Build = fn(&Spec, &dyn Scenario) -> Result<Box<dyn Policy>, RegistryErr
 ///
 /// # Errors
 /// [`RegistryError`] for an unknown name, a parameter out of its range, or a run that does not fit the scenario.
-pub fn build_policy(spec: &Spec, scenario: &dyn Scenario) -> Result<Box<dyn Policy>, RegistryError> {
+pub fn build_policy(
+    spec: &Spec,
+    scenario: &dyn Scenario,
+) -> Result<Box<dyn Policy>, RegistryError> {
     (crate::registry::find("policy", POLICIES, &spec.name)?.build)(spec, scenario)
 }
 
@@ -31,7 +34,11 @@ pub trait Policy: Send + Sync {
     }
 
     /// The policy's state for one episode; `seeds` is the episode's own node of the seed tree.
-    fn start<'a>(&'a self, scenario: &'a dyn Scenario, seeds: &Seeds) -> Box<dyn PolicyEpisode + 'a>;
+    fn start<'a>(
+        &'a self,
+        scenario: &'a dyn Scenario,
+        seeds: &Seeds,
+    ) -> Box<dyn PolicyEpisode + 'a>;
 }
 
 /// What a policy sees at one step. Flat buffers concatenate the agents in order.

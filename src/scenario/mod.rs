@@ -79,7 +79,10 @@ pub trait Scenario: Send + Sync {
 
     /// The shape of its episodes.
     fn layout(&self) -> Layout {
-        Layout { agents: self.agents().to_vec(), state_fields: self.state_fields() }
+        Layout {
+            agents: self.agents().to_vec(),
+            state_fields: self.state_fields(),
+        }
     }
 }
 
