@@ -15,9 +15,10 @@ use crate::report::mutual::{self, MutualFile};
 const DEPTH: usize = 3;
 
 /// Configuration keys that do not make two trainings different: where they go, and the seed.
-const NOT_SETTINGS: [&str; 10] = [
+const NOT_SETTINGS: [&str; 11] = [
     "ccmarl",
     "seed",
+    "log_every",
     "out",
     "force",
     "resume",
@@ -361,16 +362,8 @@ fn read_evaluation(path: &Path, run: &mut Run) -> Result<(), ReportError> {
     if let Some(other) = table.whole("seed")?.iter().find(|&&s| s != seed) {
         return Err(differs("seed", &seed.to_string(), &other.to_string()));
     }
-    if let Some(other) = agents
-        .iter()
-        .find(|&&n| n != agents[0] || (run.task.agents != 0 && n != run.task.agents))
-    {
-        let config = if run.task.agents == 0 {
-            agents[0]
-        } else {
-            run.task.agents
-        };
-        return Err(differs("agents", &config.to_string(), &other.to_string()));
+    if let Some(other) = agents.iter().find(|&&n| n != agents[0]) {
+        return Err(differs("agents", &agents[0].to_string(), &other.to_string()));
     }
     let (channels, values, losses) = (
         table.text("channel")?,
@@ -406,14 +399,14 @@ mod tests {
         let mut flat = BTreeMap::new();
         flatten(
             "",
-            &toml::Value::Table(toml::from_str("a = 1\n[maddpg]\nalpha = 0.5").unwrap()),
+            &toml::Value::Table(toml::from_str("a = 1\n[dumie]\nalpha = 0.5").unwrap()),
             &mut flat,
         );
         assert_eq!(
             flat.into_iter().collect::<Vec<_>>(),
             [
                 ("a".into(), "1".into()),
-                ("maddpg.alpha".into(), "0.5".into())
+                ("dumie.alpha".into(), "0.5".into())
             ]
         );
     }

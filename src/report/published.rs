@@ -323,10 +323,10 @@ pub(super) mod tests {
         let mut ablated = cc.clone();
         ablated
             .settings
-            .insert("maddpg.alpha".to_owned(), "0.0".to_owned());
+            .insert("dumie.alpha".to_owned(), "0.0".to_owned());
         ablated
             .settings
-            .insert("maddpg.beta".to_owned(), "0.001".to_owned());
+            .insert("dumie.beta".to_owned(), "0.001".to_owned());
         assert_eq!(
             cell(&ablated, "unrestricted"),
             Some((120.5, 82.1, "ablation"))

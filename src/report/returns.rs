@@ -189,7 +189,7 @@ fn label(
     }
     if name == "cc-maddpg" {
         let (beta, alpha) = coefficients(run);
-        for (key, value) in [("maddpg.alpha", alpha), ("maddpg.beta", beta)] {
+        for (key, value) in [("dumie.alpha", alpha), ("dumie.beta", beta)] {
             if value == Some(0.0) {
                 differing.insert(key, "0");
             }
@@ -200,7 +200,7 @@ fn label(
     }
     let words: Vec<String> = differing
         .iter()
-        .map(|(key, value)| format!("{}={value}", key.strip_prefix("maddpg.").unwrap_or(key)))
+        .map(|(key, value)| format!("{}={value}", key.strip_prefix("dumie.").unwrap_or(key)))
         .collect();
     format!("{name} ({})", words.join(", "))
 }
