@@ -1,6 +1,7 @@
 //! The crate's error: one enum per room, wrapped here, and the exit code each deserves.
 
 use crate::io::IoError;
+use crate::record::RecordError;
 use crate::registry::RegistryError;
 use crate::report::ReportError;
 use crate::schema::SchemaError;
@@ -15,6 +16,9 @@ pub enum Error {
     /// A plugin's name or parameters.
     #[error(transparent)]
     Registry(#[from] RegistryError),
+    /// Recording.
+    #[error(transparent)]
+    Record(#[from] RecordError),
     /// Data against the schema.
     #[error(transparent)]
     Schema(#[from] SchemaError),
@@ -29,10 +33,11 @@ pub enum Error {
 impl Error {
     /// Whether the user's words are at fault (exit code 2), not the data or the machine (exit code 1).
     pub fn is_usage(&self) -> bool {
-        let report = matches!(
-            self,
-            Self::Report(ReportError::Io(IoError::Exists(_)) | ReportError::NoInput)
-        );
-        report || matches!(self, Self::Registry(_) | Self::Io(IoError::Exists(_)))
+        match self {
+            Self::Registry(_) | Self::Io(IoError::Exists(_)) | Self::Record(RecordError::NoEpisodes) => true,
+            Self::Storage(StorageError::Io(IoError::Exists(_))) => true,
+            Self::Report(ReportError::Io(IoError::Exists(_)) | ReportError::NoInput) => true,
+            _ => false,
+        }
     }
 }

@@ -36,11 +36,7 @@ impl IoError {
     /// Wraps an operating-system error; for `map_err`.
     pub fn os(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.to_owned();
-        move |source| Self::Os {
-            action,
-            source,
-            path,
-        }
+        move |source| Self::Os { action, source, path }
     }
 }
 
@@ -49,11 +45,7 @@ impl IoError {
 /// # Errors
 /// [`IoError::Exists`].
 pub fn refuse_existing(path: &Path, force: bool) -> Result<(), IoError> {
-    if !force && path.symlink_metadata().is_ok() {
-        Err(IoError::Exists(path.to_owned()))
-    } else {
-        Ok(())
-    }
+    if !force && path.symlink_metadata().is_ok() { Err(IoError::Exists(path.to_owned())) } else { Ok(()) }
 }
 
 /// Reads a whole text file of at most `limit` bytes.
@@ -66,9 +58,7 @@ pub fn read_text(path: &Path, limit: u64) -> Result<String, IoError> {
     }
     let mut text = String::new();
     let file = File::open(path).map_err(IoError::os("open", path))?;
-    file.take(limit + 1)
-        .read_to_string(&mut text)
-        .map_err(IoError::os("read as UTF-8 text", path))?;
+    file.take(limit + 1).read_to_string(&mut text).map_err(IoError::os("read as UTF-8 text", path))?;
     if text.len() as u64 > limit {
         let too_large = std::io::Error::other(format!("larger than the limit of {limit} bytes"));
         return Err(IoError::os("read", path)(too_large));
@@ -82,8 +72,7 @@ pub fn read_text(path: &Path, limit: u64) -> Result<String, IoError> {
 /// [`IoError::Os`].
 pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), IoError> {
     create_parent(path)?;
-    let mut file =
-        atomic_write_file::AtomicWriteFile::open(path).map_err(IoError::os("create", path))?;
+    let mut file = atomic_write_file::AtomicWriteFile::open(path).map_err(IoError::os("create", path))?;
     file.write_all(bytes).map_err(IoError::os("write", path))?;
     file.commit().map_err(IoError::os("put in place", path))
 }
@@ -103,9 +92,7 @@ pub fn create_parent(path: &Path) -> Result<(), IoError> {
 
 /// The sibling `.<name>.partial` in which an output is built before it takes its name.
 pub fn partial_path(path: &Path) -> PathBuf {
-    let name = path
-        .file_name()
-        .map_or_else(|| "out".into(), |n| n.to_string_lossy().into_owned());
+    let name = path.file_name().map_or_else(|| "out".into(), |n| n.to_string_lossy().into_owned());
     path.with_file_name(format!(".{name}.partial"))
 }
 
@@ -118,21 +105,14 @@ pub fn partial_path(path: &Path) -> PathBuf {
 pub fn publish(from: &Path, to: &Path, force: bool, marker: &str) -> Result<(), IoError> {
     refuse_existing(to, force)?;
     if to.is_dir() {
-        let empty = std::fs::read_dir(to)
-            .map_err(IoError::os("list", to))?
-            .next()
-            .is_none();
+        let empty = std::fs::read_dir(to).map_err(IoError::os("list", to))?.next().is_none();
         if !empty && !to.join(marker).exists() {
             return Err(IoError::Foreign(to.to_owned()));
         }
         std::fs::remove_dir_all(to).map_err(IoError::os("replace", to))?;
     }
     std::fs::rename(from, to).map_err(IoError::os("put in place", to))?;
-    sync_dir(
-        to.parent()
-            .filter(|p| !p.as_os_str().is_empty())
-            .unwrap_or(Path::new(".")),
-    )
+    sync_dir(to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")))
 }
 
 /// Makes a rename in `dir` durable.
@@ -140,9 +120,7 @@ pub fn publish(from: &Path, to: &Path, force: bool, marker: &str) -> Result<(), 
 /// # Errors
 /// [`IoError::Os`].
 pub fn sync_dir(dir: &Path) -> Result<(), IoError> {
-    File::open(dir)
-        .and_then(|d| d.sync_all())
-        .map_err(IoError::os("sync", dir))
+    File::open(dir).and_then(|d| d.sync_all()).map_err(IoError::os("sync", dir))
 }
 
 /// SHA-256 of a file, 64 hex digits, and its size in bytes; reads in blocks.
@@ -167,13 +145,5 @@ pub fn sha256_file(path: &Path) -> Result<(String, u64), IoError> {
 
 /// Text that came from a file, safe to print on a terminal: control characters are shown escaped.
 pub fn printable(text: &str) -> String {
-    text.chars()
-        .flat_map(|c| {
-            if c.is_control() {
-                c.escape_default().collect()
-            } else {
-                vec![c]
-            }
-        })
-        .collect()
+    text.chars().flat_map(|c| if c.is_control() { c.escape_default().collect() } else { vec![c] }).collect()
 }

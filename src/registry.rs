@@ -67,10 +67,7 @@ pub struct Spec {
 impl Spec {
     /// A plugin without parameters.
     pub fn new(name: &str) -> Self {
-        Self {
-            name: name.to_owned(),
-            params: Map::new(),
-        }
+        Self { name: name.to_owned(), params: Map::new() }
     }
 
     /// The same plugin with one more parameter.
@@ -84,23 +81,13 @@ impl Spec {
     ///
     /// # Errors
     /// [`RegistryError::Unknown`] with the nearest names, [`RegistryError::NoValue`].
-    pub fn parse<B>(
-        kind: &'static str,
-        entries: &[Entry<B>],
-        text: &str,
-    ) -> Result<Self, RegistryError> {
-        let (name, value) = text
-            .split_once(':')
-            .map_or((text, None), |(n, v)| (n, Some(v)));
+    pub fn parse<B>(kind: &'static str, entries: &[Entry<B>], text: &str) -> Result<Self, RegistryError> {
+        let (name, value) = text.split_once(':').map_or((text, None), |(n, v)| (n, Some(v)));
         let entry = find(kind, entries, name)?;
         let mut spec = Self::new(entry.name);
         if let Some(value) = value {
             let Some(key) = entry.value else {
-                return Err(RegistryError::NoValue {
-                    kind,
-                    name: name.to_owned(),
-                    value: value.to_owned(),
-                });
+                return Err(RegistryError::NoValue { kind, name: name.to_owned(), value: value.to_owned() });
             };
             let parsed = value.parse::<f64>().ok().filter(|v| v.is_finite());
             let json = match (value.parse::<i64>(), parsed) {
@@ -118,20 +105,24 @@ impl Spec {
     /// # Errors
     /// [`RegistryError::Params`] that names the field.
     pub fn params<P: DeserializeOwned>(&self) -> Result<P, RegistryError> {
-        serde_json::from_value(Value::Object(self.params.clone())).map_err(|e| {
-            RegistryError::Params {
-                name: self.name.clone(),
-                message: e.to_string(),
-            }
-        })
+        serde_json::from_value(Value::Object(self.params.clone()))
+            .map_err(|e| RegistryError::Params { name: self.name.clone(), message: e.to_string() })
+    }
+
+    /// Checks that the parameter `key` lies in `[low, high]`.
+    ///
+    /// # Errors
+    /// [`RegistryError::Params`] that names the range and what was found.
+    pub fn in_range(&self, key: &str, value: f64, low: f64, high: f64) -> Result<(), RegistryError> {
+        if value >= low && value <= high {
+            return Ok(());
+        }
+        Err(self.invalid(format!("{key} must be in [{low}, {high}], found {value}")))
     }
 
     /// An error about this plugin's parameters.
     pub fn invalid(&self, message: impl Into<String>) -> RegistryError {
-        RegistryError::Params {
-            name: self.name.clone(),
-            message: message.into(),
-        }
+        RegistryError::Params { name: self.name.clone(), message: message.into() }
     }
 }
 
@@ -163,17 +154,11 @@ impl<'de> Deserialize<'de> for Spec {
         let mut params = match Value::deserialize(deserializer)? {
             Value::String(name) => return Ok(Self::new(&name)),
             Value::Object(map) => map,
-            other => {
-                return Err(serde::de::Error::custom(format!(
-                    "expected a name or {{ name = … }}, found {other}"
-                )));
-            }
+            other => return Err(serde::de::Error::custom(format!("expected a name or {{ name = … }}, found {other}"))),
         };
         match params.remove("name") {
             Some(Value::String(name)) => Ok(Self { name, params }),
-            _ => Err(serde::de::Error::custom(
-                "a plugin table needs the key `name`",
-            )),
+            _ => Err(serde::de::Error::custom("a plugin table needs the key `name`")),
         }
     }
 }
@@ -182,33 +167,19 @@ impl<'de> Deserialize<'de> for Spec {
 ///
 /// # Errors
 /// [`RegistryError::Unknown`] with the nearest names.
-pub fn find<'a, B>(
-    kind: &'static str,
-    entries: &'a [Entry<B>],
-    name: &str,
-) -> Result<&'a Entry<B>, RegistryError> {
-    entries
-        .iter()
-        .find(|e| e.name == name)
-        .ok_or_else(|| RegistryError::Unknown {
-            kind,
-            name: name.to_owned(),
-            hint: did_you_mean(name, entries.iter().map(|e| e.name)),
-        })
+pub fn find<'a, B>(kind: &'static str, entries: &'a [Entry<B>], name: &str) -> Result<&'a Entry<B>, RegistryError> {
+    entries.iter().find(|e| e.name == name).ok_or_else(|| RegistryError::Unknown {
+        kind,
+        name: name.to_owned(),
+        hint: did_you_mean(name, entries.iter().map(|e| e.name)),
+    })
 }
 
 /// "did you mean a, b?" for the candidates nearest to `name`, or the whole list when none is near.
 pub fn did_you_mean<'a>(name: &str, candidates: impl Iterator<Item = &'a str>) -> String {
-    let mut scored: Vec<(f64, &str)> = candidates
-        .map(|c| (strsim::jaro_winkler(name, c), c))
-        .collect();
+    let mut scored: Vec<(f64, &str)> = candidates.map(|c| (strsim::jaro_winkler(name, c), c)).collect();
     scored.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(b.1)));
-    let near: Vec<&str> = scored
-        .iter()
-        .filter(|(s, _)| *s > 0.75)
-        .take(3)
-        .map(|(_, c)| *c)
-        .collect();
+    let near: Vec<&str> = scored.iter().filter(|(s, _)| *s > 0.75).take(3).map(|(_, c)| *c).collect();
     if near.is_empty() {
         let mut all: Vec<&str> = scored.iter().map(|(_, c)| *c).collect();
         all.sort_unstable();
@@ -224,20 +195,8 @@ mod tests {
     use super::*;
 
     const KIND: &[Entry<()>] = &[
-        Entry {
-            name: "dropout",
-            summary: "",
-            reference: "",
-            value: Some("p"),
-            build: (),
-        },
-        Entry {
-            name: "perfect",
-            summary: "",
-            reference: "",
-            value: None,
-            build: (),
-        },
+        Entry { name: "dropout", summary: "", reference: "", value: Some("p"), build: () },
+        Entry { name: "perfect", summary: "", reference: "", value: None, build: () },
     ];
 
     #[test]
@@ -245,36 +204,17 @@ mod tests {
         let spec = Spec::parse("link", KIND, "dropout:0.2").unwrap();
         assert_eq!(spec, Spec::new("dropout").with("p", 0.2));
         assert_eq!(spec.to_string(), "dropout:0.2");
-        assert_eq!(
-            serde_json::to_string(&spec).unwrap(),
-            r#"{"name":"dropout","p":0.2}"#
-        );
-        assert_eq!(
-            serde_json::from_str::<Spec>(r#"{"name":"dropout","p":0.2}"#).unwrap(),
-            spec
-        );
+        assert_eq!(serde_json::to_string(&spec).unwrap(), r#"{"name":"dropout","p":0.2}"#);
+        assert_eq!(serde_json::from_str::<Spec>(r#"{"name":"dropout","p":0.2}"#).unwrap(), spec);
     }
 
     #[test]
     fn wrong_names_and_superfluous_values_say_what_to_do() {
-        let unknown = Spec::parse("link", KIND, "dropuot")
-            .unwrap_err()
-            .to_string();
-        assert_eq!(
-            unknown,
-            "unknown link \"dropuot\": did you mean dropout? (`ccmarl list` shows all)"
-        );
+        let unknown = Spec::parse("link", KIND, "dropuot").unwrap_err().to_string();
+        assert_eq!(unknown, "unknown link \"dropuot\": did you mean dropout? (`ccmarl list` shows all)");
         let none_near = Spec::parse("link", KIND, "zzz").unwrap_err().to_string();
-        assert!(
-            none_near.contains("known are dropout, perfect"),
-            "{none_near}"
-        );
-        let value = Spec::parse("link", KIND, "perfect:1")
-            .unwrap_err()
-            .to_string();
-        assert_eq!(
-            value,
-            "link \"perfect\" takes no value, but \"1\" was given: write just perfect"
-        );
+        assert!(none_near.contains("known are dropout, perfect"), "{none_near}");
+        let value = Spec::parse("link", KIND, "perfect:1").unwrap_err().to_string();
+        assert_eq!(value, "link \"perfect\" takes no value, but \"1\" was given: write just perfect");
     }
 }

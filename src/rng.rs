@@ -23,9 +23,7 @@ impl Seeds {
         let mut hash = Sha256::new();
         hash.update(b"ccmarl seed v1");
         hash.update(seed.to_le_bytes());
-        Self {
-            key: hash.finalize().into(),
-        }
+        Self { key: hash.finalize().into() }
     }
 
     /// The node called `name` below this one.
@@ -34,9 +32,7 @@ impl Seeds {
         let mut hash = Sha256::new();
         hash.update(self.key);
         hash.update(name.as_bytes());
-        Self {
-            key: hash.finalize().into(),
-        }
+        Self { key: hash.finalize().into() }
     }
 
     /// The numbered node `name/index` below this one.
@@ -47,9 +43,12 @@ impl Seeds {
         hash.update(name.as_bytes());
         hash.update(b"/");
         hash.update(index.to_le_bytes());
-        Self {
-            key: hash.finalize().into(),
-        }
+        Self { key: hash.finalize().into() }
+    }
+
+    /// A seed for another tree that belongs below this node.
+    pub fn seed(&self) -> u64 {
+        self.key.iter().take(8).fold(0, |seed, &byte| (seed << 8) | u64::from(byte))
     }
 
     /// A fresh stream, at its start, named `name` below this node.
@@ -74,11 +73,7 @@ pub struct StreamState {
 /// Saves where `stream` stands.
 pub fn save(stream: &Stream) -> StreamState {
     let pos = stream.get_word_pos();
-    StreamState {
-        seed: stream.get_seed(),
-        word_pos_low: pos as u64,
-        word_pos_high: (pos >> 64) as u64,
-    }
+    StreamState { seed: stream.get_seed(), word_pos_low: pos as u64, word_pos_high: (pos >> 64) as u64 }
 }
 
 /// Makes a stream that goes on where `state` was saved.
@@ -107,11 +102,7 @@ pub fn normal<R: Rng + ?Sized>(rng: &mut R) -> f64 {
 
 /// A whole number in `0..n`; 0 when `n` is 0.
 pub fn below<R: Rng + ?Sized>(rng: &mut R, n: usize) -> usize {
-    if n < 2 {
-        0
-    } else {
-        rng.random_range(0..n as u64) as usize
-    }
+    if n < 2 { 0 } else { rng.random_range(0..n as u64) as usize }
 }
 
 /// A uniform random permutation of `0..n`.
@@ -143,10 +134,7 @@ mod tests {
         assert_eq!(a, normal(&mut seeds.stream("a")));
         assert_ne!(a, normal(&mut seeds.stream("b")));
         assert_ne!(a, normal(&mut Seeds::new(2).stream("a")));
-        assert_ne!(
-            normal(&mut seeds.indexed_stream("e", 1)),
-            normal(&mut seeds.indexed_stream("e", 11))
-        );
+        assert_ne!(normal(&mut seeds.indexed_stream("e", 1)), normal(&mut seeds.indexed_stream("e", 11)));
     }
 
     #[test]
@@ -163,12 +151,7 @@ mod tests {
     fn a_derangement_has_no_fixed_point() {
         let mut rng = Seeds::new(3).stream("d");
         for n in 2..40 {
-            assert!(
-                derangement(&mut rng, n)
-                    .iter()
-                    .enumerate()
-                    .all(|(i, &j)| i != j)
-            );
+            assert!(derangement(&mut rng, n).iter().enumerate().all(|(i, &j)| i != j));
         }
     }
 

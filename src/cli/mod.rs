@@ -1,10 +1,7 @@
 //! The command line: one file per subcommand. The only place for anyhow, printing, progress bars and tables.
-#![expect(
-    clippy::print_stdout,
-    clippy::print_stderr,
-    reason = "the face of the program prints"
-)]
+#![expect(clippy::print_stdout, clippy::print_stderr, reason = "the face of the program prints")]
 
+mod record;
 mod report;
 mod ui;
 
@@ -14,14 +11,7 @@ use clap::{Parser, Subcommand};
 
 /// Record, measure, train and compare agents that talk over unreliable links.
 #[derive(Debug, Parser)]
-#[command(
-    name = "ccmarl",
-    version,
-    about,
-    propagate_version = true,
-    arg_required_else_help = true,
-    max_term_width = 100
-)]
+#[command(name = "ccmarl", version, about, propagate_version = true, arg_required_else_help = true, max_term_width = 100)]
 pub struct Cli {
     /// What to do
     #[command(subcommand)]
@@ -31,6 +21,8 @@ pub struct Cli {
 /// The subcommands.
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Record episodes of a scenario under a policy and a link
+    Record(record::Args),
     /// Tables, figures and one self-contained page from run directories
     Report(report::ReportArgs),
 }
@@ -53,11 +45,7 @@ pub fn main() -> ExitCode {
         Ok(cli) => cli,
         Err(error) => {
             let code = u8::try_from(error.exit_code()).unwrap_or(2);
-            return if error.print().is_ok() {
-                ExitCode::from(code)
-            } else {
-                ExitCode::SUCCESS
-            };
+            return if error.print().is_ok() { ExitCode::from(code) } else { ExitCode::SUCCESS };
         }
     };
     match dispatch(cli.command) {
@@ -70,6 +58,7 @@ pub fn main() -> ExitCode {
 
 fn dispatch(command: Command) -> anyhow::Result<Outcome> {
     match command {
+        Command::Record(args) => record::run(&args),
         Command::Report(args) => report::run(&args),
     }
 }

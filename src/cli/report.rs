@@ -35,23 +35,13 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
     crate::io::refuse_existing(&args.out, args.force).map_err(crate::Error::from)?;
     let collected = collect(&args.runs, &args.mi).map_err(crate::Error::from)?;
     let command = command_line(std::env::args_os().map(|a| a.to_string_lossy().into_owned()));
-    let request = Request {
-        out: &args.out,
-        force: args.force,
-        title: &args.title,
-        command: &command,
-        references: &[],
-    };
+    let request = Request { out: &args.out, force: args.force, title: &args.title, command: &command, references: &[] };
     let summary = write(&collected, &request).map_err(crate::Error::from)?;
     match args.format {
         Format::Json => ui::print_json(&summary.tidy())?,
         Format::Table => print_table(&summary)?,
     }
-    ui::say(&format!(
-        "{} figures and the tables are on {}",
-        summary.figures,
-        summary.page.display()
-    ));
+    ui::say(&format!("{} figures and the tables are on {}", summary.figures, summary.page.display()));
     Ok(Outcome::Done)
 }
 
@@ -61,19 +51,13 @@ fn print_table(summary: &Summary) -> anyhow::Result<()> {
         if index > 0 {
             ui::print("")?;
         }
-        ui::print(&format!(
-            "{}: mean return per episode",
-            crate::io::printable(&table.task.to_string())
-        ))?;
+        ui::print(&format!("{}: mean return per episode", crate::io::printable(&table.task.to_string())))?;
         let mut header = vec!["algorithm", "seeds"];
         header.extend(table.channels.iter().map(String::as_str));
         let mut rows = Vec::new();
         for row in &table.rows {
             let mut line = vec![row.series.clone(), row.seeds.len().to_string()];
-            line.extend(row.cells.iter().map(|c| {
-                c.as_ref()
-                    .map_or("-".to_owned(), |c| format!("{:.1}", c.mean))
-            }));
+            line.extend(row.cells.iter().map(|c| c.as_ref().map_or("-".to_owned(), |c| format!("{:.1}", c.mean))));
             rows.push(line);
         }
         for (name, mean, ..) in &table.references {
@@ -89,20 +73,10 @@ fn print_table(summary: &Summary) -> anyhow::Result<()> {
 /// The command as one would type it again; the program's own path is its name.
 fn command_line(args: impl Iterator<Item = String>) -> String {
     let quote = |arg: String| {
-        let plain = !arg.is_empty()
-            && arg
-                .chars()
-                .all(|c| c.is_ascii_alphanumeric() || "-_./=:,+@%".contains(c));
-        if plain {
-            arg
-        } else {
-            format!("'{}'", arg.replace('\'', r"'\''"))
-        }
+        let plain = !arg.is_empty() && arg.chars().all(|c| c.is_ascii_alphanumeric() || "-_./=:,+@%".contains(c));
+        if plain { arg } else { format!("'{}'", arg.replace('\'', r"'\''")) }
     };
-    std::iter::once("ccmarl".to_owned())
-        .chain(args.skip(1).map(quote))
-        .collect::<Vec<_>>()
-        .join(" ")
+    std::iter::once("ccmarl".to_owned()).chain(args.skip(1).map(quote)).collect::<Vec<_>>().join(" ")
 }
 
 #[cfg(test)]
@@ -112,9 +86,6 @@ mod tests {
     #[test]
     fn the_command_can_be_pasted_into_a_shell() {
         let args = ["/x/ccmarl", "report", "a b", "it's", "--out", "r"].map(str::to_owned);
-        assert_eq!(
-            command_line(args.into_iter()),
-            r"ccmarl report 'a b' 'it'\''s' --out r"
-        );
+        assert_eq!(command_line(args.into_iter()), r"ccmarl report 'a b' 'it'\''s' --out r");
     }
 }

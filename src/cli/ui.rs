@@ -52,20 +52,10 @@ pub fn print_table(header: &[&str], rows: &[Vec<String>]) -> anyhow::Result<()> 
     table.load_style(comfy_table::presets::NOTHING);
     table.set_header(header.to_vec());
     for row in rows {
-        table.add_row(
-            row.iter()
-                .map(|cell| crate::io::printable(cell))
-                .collect::<Vec<_>>(),
-        );
+        table.add_row(row.iter().map(|cell| crate::io::printable(cell)).collect::<Vec<_>>());
     }
     let text = table.to_string();
-    print(
-        &text
-            .lines()
-            .map(str::trim_end)
-            .collect::<Vec<_>>()
-            .join("\n"),
-    )
+    print(&text.lines().map(str::trim_end).collect::<Vec<_>>().join("\n"))
 }
 
 /// Says something to the user on stderr.
@@ -91,9 +81,6 @@ pub fn report_error(error: &anyhow::Error) -> ExitCode {
         return ExitCode::SUCCESS;
     }
     eprintln!("error: {}", crate::io::printable(&format!("{error:#}")));
-    let usage = error.chain().any(|e| {
-        e.downcast_ref::<crate::Error>()
-            .is_some_and(crate::Error::is_usage)
-    });
+    let usage = error.chain().any(|e| e.downcast_ref::<crate::Error>().is_some_and(crate::Error::is_usage));
     ExitCode::from(if usage { 2 } else { 1 })
 }

@@ -44,54 +44,28 @@ struct Figure<'a> {
 }
 
 fn render(data: &Data, target: Target<'_>) -> Result<(), FigureError> {
-    let points = || {
-        data.curves
-            .iter()
-            .flat_map(|c| c.points.iter().map(move |p| (c, p)))
-    };
+    let points = || data.curves.iter().flat_map(|c| c.points.iter().map(move |p| (c, p)));
     let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
     for (curve, point) in points() {
         let (bottom, top) = point.band.unwrap_or((point.value, point.value));
         for value in [point.step, point.value, bottom, top] {
             if !value.is_finite() {
                 let what = format!("a point of {:?} at step {}", curve.series, point.step);
-                return Err(FigureError::NotFinite {
-                    figure: NAME,
-                    what,
-                    value,
-                });
+                return Err(FigureError::NotFinite { figure: NAME, what, value });
             }
         }
-        (low, high) = (
-            low.min(bottom).min(point.value),
-            high.max(top).max(point.value),
-        );
+        (low, high) = (low.min(bottom).min(point.value), high.max(top).max(point.value));
     }
     if low > high {
-        return Err(FigureError::Empty {
-            figure: NAME,
-            needs: "curve with points",
-        });
+        return Err(FigureError::Empty { figure: NAME, needs: "curve with points" });
     }
     for line in data.references.iter().filter(|l| l.value.is_finite()) {
         (low, high) = (low.min(line.value), high.max(line.value));
     }
-    let shown = data
-        .series
-        .iter()
-        .enumerate()
-        .filter(|(_, s)| data.curves.iter().any(|c| c.series == **s));
+    let shown = data.series.iter().enumerate().filter(|(_, s)| data.curves.iter().any(|c| c.series == **s));
     let colors = shown.map(|(i, s)| (s.clone(), style::color(i))).collect();
     let steps = points().map(|(_, p)| p.step).fold(1.0, f64::max);
-    style::render(
-        &Figure {
-            data,
-            colors,
-            steps,
-            values: style::axis(low, high),
-        },
-        target,
-    )
+    style::render(&Figure { data, colors, steps, values: style::axis(low, high) }, target)
 }
 
 /// Steps in the unit that keeps tick labels short.
@@ -109,13 +83,7 @@ impl Draw for Figure<'_> {
     }
 
     fn draw<DB: DrawingBackend>(&self, area: &Area<DB>) -> Drawn<DB> {
-        let below = style::header(
-            area,
-            &self.data.title,
-            &self.data.subtitle,
-            &self.colors,
-            &self.data.references,
-        )?;
+        let below = style::header(area, &self.data.title, &self.data.subtitle, &self.colors, &self.data.references)?;
         let mut chart = ChartBuilder::on(&below)
             .margin_right(50)
             .margin_bottom(16)
@@ -123,34 +91,20 @@ impl Draw for Figure<'_> {
             .y_label_area_size(140)
             .build_cartesian_2d(0.0..self.steps, self.values.clone())?;
         let x_label = |x: &f64| steps_label(*x, self.steps);
-        style::mesh(
-            &mut chart,
-            &self.data.unit,
-            Some("environment steps"),
-            &x_label,
-        )?;
+        style::mesh(&mut chart, &self.data.unit, Some("environment steps"), &x_label)?;
         style::draw_references(&mut chart, &self.data.references)?;
         for curve in &self.data.curves {
             let Some((_, color)) = self.colors.iter().find(|(s, _)| *s == curve.series) else {
                 continue;
             };
-            let band: Vec<_> = curve
-                .points
-                .iter()
-                .filter_map(|p| p.band.map(|b| (p.step, b)))
-                .collect();
+            let band: Vec<_> = curve.points.iter().filter_map(|p| p.band.map(|b| (p.step, b))).collect();
             if !band.is_empty() {
                 let edge = band.iter().map(|&(x, (low, _))| (x, low));
-                let outline = edge
-                    .chain(band.iter().rev().map(|&(x, (_, high))| (x, high)))
-                    .collect::<Vec<_>>();
+                let outline = edge.chain(band.iter().rev().map(|&(x, (_, high))| (x, high))).collect::<Vec<_>>();
                 chart.draw_series(std::iter::once(Polygon::new(outline, color.mix(0.18))))?;
             }
             let line = curve.points.iter().map(|p| (p.step, p.value));
-            chart.draw_series(LineSeries::new(
-                line,
-                color.stroke_width(if band.is_empty() { 3 } else { 5 }),
-            ))?;
+            chart.draw_series(LineSeries::new(line, color.stroke_width(if band.is_empty() { 3 } else { 5 })))?;
         }
         Ok(())
     }

@@ -13,11 +13,7 @@ use std::path::{Path, PathBuf};
 use crate::registry::Entry;
 
 /// All figures.
-pub const FIGURES: &[Entry<Render>] = &[
-    learning_curves::ENTRY,
-    channel_returns::ENTRY,
-    mi_heatmap::ENTRY,
-];
+pub const FIGURES: &[Entry<Render>] = &[learning_curves::ENTRY, channel_returns::ENTRY, mi_heatmap::ENTRY];
 
 /// Draws a figure from `data` onto a target.
 pub type Render = fn(&Data, Target<'_>) -> Result<(), FigureError>;
@@ -167,11 +163,7 @@ mod tests {
 
     /// Data that every figure can draw, with hostile names.
     fn sample() -> Data {
-        let point = |step: f64| Point {
-            step,
-            value: step / 1e3 - 90.0,
-            band: Some((step / 1e3 - 95.0, -20.0)),
-        };
+        let point = |step: f64| Point { step, value: step / 1e3 - 90.0, band: Some((step / 1e3 - 95.0, -20.0)) };
         let bar = |group: &str, value| Bar {
             group: group.to_owned(),
             series: "<b>&\u{1}".to_owned(),
@@ -190,15 +182,9 @@ mod tests {
             subtitle: "± over seeds".to_owned(),
             unit: "return per episode".to_owned(),
             series: vec!["<b>&\u{1}".to_owned()],
-            curves: vec![Curve {
-                series: "<b>&\u{1}".to_owned(),
-                points: vec![point(0.0), point(1e4), point(2e4)],
-            }],
+            curves: vec![Curve { series: "<b>&\u{1}".to_owned(), points: vec![point(0.0), point(1e4), point(2e4)] }],
             bars: vec![bar("unrestricted", -80.0), bar("none", -120.0)],
-            references: vec![Reference {
-                label: "random".to_owned(),
-                value: -200.0,
-            }],
+            references: vec![Reference { label: "random".to_owned(), value: -200.0 }],
             cells: vec![cell("delivered", 0.4133), cell("lost", f64::NAN)],
         }
     }
@@ -209,29 +195,13 @@ mod tests {
         for entry in FIGURES {
             let text = svg(entry, &sample()).unwrap();
             assert_eq!(text, svg(entry, &sample()).unwrap(), "{}", entry.name);
-            assert!(
-                text.starts_with("<svg") && text.trim_end().ends_with("</svg>"),
-                "{}",
-                entry.name
-            );
-            assert!(
-                text.contains("a &lt; b"),
-                "{}: the title is there, escaped",
-                entry.name
-            );
-            assert!(
-                !text.contains("<b>") && !text.contains('\u{1}'),
-                "{}: data cannot become markup",
-                entry.name
-            );
+            assert!(text.starts_with("<svg") && text.trim_end().ends_with("</svg>"), "{}", entry.name);
+            assert!(text.contains("a &lt; b"), "{}: the title is there, escaped", entry.name);
+            assert!(!text.contains("<b>") && !text.contains('\u{1}'), "{}: data cannot become markup", entry.name);
             let path = dir.path().join(format!("{}.png", entry.name));
             png(entry, &sample(), &path).unwrap();
             let first = std::fs::read(&path).unwrap();
-            assert!(
-                first.starts_with(b"\x89PNG") && first.len() > 5_000,
-                "{}",
-                entry.name
-            );
+            assert!(first.starts_with(b"\x89PNG") && first.len() > 5_000, "{}", entry.name);
             png(entry, &sample(), &path).unwrap();
             assert_eq!(first, std::fs::read(&path).unwrap(), "{}", entry.name);
         }
@@ -239,10 +209,7 @@ mod tests {
 
     #[test]
     fn no_data_is_a_typed_error() {
-        let messages: Vec<String> = FIGURES
-            .iter()
-            .map(|e| svg(e, &Data::default()).unwrap_err().to_string())
-            .collect();
+        let messages: Vec<String> = FIGURES.iter().map(|e| svg(e, &Data::default()).unwrap_err().to_string()).collect();
         assert_eq!(
             messages,
             [
@@ -258,23 +225,12 @@ mod tests {
         let mut data = sample();
         data.bars[1].value = f64::NAN;
         let error = svg(&FIGURES[1], &data).unwrap_err().to_string();
-        assert!(
-            error.starts_with(
-                "figure channel-returns: the bar of \"<b>&\\u{1}\" at \"none\" is NaN"
-            ),
-            "{error}"
-        );
+        assert!(error.starts_with("figure channel-returns: the bar of \"<b>&\\u{1}\" at \"none\" is NaN"), "{error}");
     }
 
     #[test]
     fn a_png_into_a_missing_directory_names_the_path() {
-        let error = png(&FIGURES[1], &sample(), Path::new("/nowhere/x.png"))
-            .unwrap_err()
-            .to_string();
-        assert!(
-            error.starts_with("could not write the figure: ")
-                && error.ends_with(": /nowhere/x.png"),
-            "{error}"
-        );
+        let error = png(&FIGURES[1], &sample(), Path::new("/nowhere/x.png")).unwrap_err().to_string();
+        assert!(error.starts_with("could not write the figure: ") && error.ends_with(": /nowhere/x.png"), "{error}");
     }
 }

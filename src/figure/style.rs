@@ -16,8 +16,7 @@ use crate::io::printable;
 pub(super) type Area<DB> = DrawingArea<DB, Shift>;
 
 /// Result of drawing on a backend.
-pub(super) type Drawn<DB, T = ()> =
-    Result<T, DrawingAreaErrorKind<<DB as DrawingBackend>::ErrorType>>;
+pub(super) type Drawn<DB, T = ()> = Result<T, DrawingAreaErrorKind<<DB as DrawingBackend>::ErrorType>>;
 
 /// Text height of titles, units.
 pub(super) const TITLE: f64 = 40.0;
@@ -58,45 +57,27 @@ pub(super) trait Draw {
 /// Draws `figure` onto `target`.
 pub(super) fn render(figure: &impl Draw, target: Target<'_>) -> Result<(), FigureError> {
     let font = include_bytes!("../../assets/fonts/DejaVuSans.ttf");
-    if !FONT.get_or_init(|| {
-        plotters::style::register_font("sans-serif", FontStyle::Normal, font).is_ok()
-    }) {
-        return Err(FigureError::Draw(
-            "the built-in font was not accepted".to_owned(),
-        ));
+    if !FONT.get_or_init(|| plotters::style::register_font("sans-serif", FontStyle::Normal, font).is_ok()) {
+        return Err(FigureError::Draw("the built-in font was not accepted".to_owned()));
     }
     let (width, height) = figure.size();
     match target {
         Target::Svg(out) => {
             let mut text = String::new();
-            draw_on(figure, SVGBackend::with_string(&mut text, (width, height)))
-                .map_err(FigureError::Draw)?;
+            draw_on(figure, SVGBackend::with_string(&mut text, (width, height))).map_err(FigureError::Draw)?;
             let full = format!("width=\"{width}\" height=\"{height}\"");
-            let half = format!(
-                "width=\"{}\" height=\"{}\" role=\"img\"",
-                width / 2,
-                height / 2
-            );
+            let half = format!("width=\"{}\" height=\"{}\" role=\"img\"", width / 2, height / 2);
             out.push_str(&text.replacen(&full, &half, 1));
             Ok(())
         }
-        Target::Png(path) => {
-            draw_on(figure, BitMapBackend::new(path, (width, height))).map_err(|message| {
-                FigureError::Write {
-                    message,
-                    path: path.to_owned(),
-                }
-            })
-        }
+        Target::Png(path) => draw_on(figure, BitMapBackend::new(path, (width, height)))
+            .map_err(|message| FigureError::Write { message, path: path.to_owned() }),
     }
 }
 
 fn draw_on<DB: DrawingBackend>(figure: &impl Draw, backend: DB) -> Result<(), String> {
     let area = backend.into_drawing_area();
-    area.fill(&WHITE)
-        .and_then(|()| figure.draw(&area))
-        .and_then(|()| area.present())
-        .map_err(|e| e.to_string())
+    area.fill(&WHITE).and_then(|()| figure.draw(&area)).and_then(|()| area.present()).map_err(|e| e.to_string())
 }
 
 /// The colour of the series at `index`.
@@ -106,9 +87,7 @@ pub(super) fn color(index: usize) -> RGBColor {
 
 /// Text of a height, a colour and an anchor.
 pub(super) fn text(size: f64, color: RGBColor, h: HPos, v: VPos) -> TextStyle<'static> {
-    TextStyle::from(("sans-serif", size).into_font())
-        .color(&color)
-        .pos(Pos::new(h, v))
+    TextStyle::from(("sans-serif", size).into_font()).color(&color).pos(Pos::new(h, v))
 }
 
 /// A string from data, fit to be drawn: control characters escaped, cut after `limit` characters.
@@ -117,25 +96,14 @@ pub(super) fn label(text: &str, limit: usize) -> String {
     if clean.chars().count() <= limit {
         return clean;
     }
-    clean
-        .chars()
-        .take(limit.saturating_sub(1))
-        .chain(['…'])
-        .collect()
+    clean.chars().take(limit.saturating_sub(1)).chain(['…']).collect()
 }
 
 /// A number for axes and cells, with a true minus sign.
 pub(super) fn number(value: f64, decimals: usize) -> String {
     let text = format!("{value:.decimals$}");
-    let zero = text
-        .trim_start_matches('-')
-        .chars()
-        .all(|c| c == '0' || c == '.');
-    if zero {
-        text.trim_start_matches('-').to_owned()
-    } else {
-        text.replace('-', "−")
-    }
+    let zero = text.trim_start_matches('-').chars().all(|c| c == '0' || c == '.');
+    if zero { text.trim_start_matches('-').to_owned() } else { text.replace('-', "−") }
 }
 
 /// Decimals that tell the ticks of an axis of this length apart.
@@ -164,18 +132,10 @@ pub(super) fn header<DB: DrawingBackend>(
 ) -> Drawn<DB, Area<DB>> {
     let width = area.dim_in_pixel().0 as i32;
     let mut y = 22;
-    area.draw_text(
-        &label(title, 74),
-        &text(TITLE, INK, HPos::Left, VPos::Top),
-        (40, y),
-    )?;
+    area.draw_text(&label(title, 74), &text(TITLE, INK, HPos::Left, VPos::Top), (40, y))?;
     y += 56;
     if !subtitle.is_empty() {
-        area.draw_text(
-            &label(subtitle, 108),
-            &text(TICK, SOFT, HPos::Left, VPos::Top),
-            (40, y),
-        )?;
+        area.draw_text(&label(subtitle, 108), &text(TICK, SOFT, HPos::Left, VPos::Top), (40, y))?;
         y += 42;
     }
     let style = text(LABEL, INK, HPos::Left, VPos::Top);
@@ -190,16 +150,10 @@ pub(super) fn header<DB: DrawingBackend>(
         if dash {
             for k in 0..3 {
                 let from = x + 18 * k;
-                area.draw(&Rectangle::new(
-                    [(from, y + 15), (from + 11, y + 18)],
-                    color.filled(),
-                ))?;
+                area.draw(&Rectangle::new([(from, y + 15), (from + 11, y + 18)], color.filled()))?;
             }
         } else {
-            area.draw(&Rectangle::new(
-                [(x, y + 4), (x + 44, y + 29)],
-                color.filled(),
-            ))?;
+            area.draw(&Rectangle::new([(x, y + 4), (x + 44, y + 29)], color.filled()))?;
         }
         area.draw_text(&name, &style, (x + 58, y))?;
         x += 58 + long + 44;
@@ -211,11 +165,7 @@ pub(super) fn header<DB: DrawingBackend>(
     for (index, line) in references.iter().enumerate() {
         entry(&line.label, reference_color(index), true)?;
     }
-    let below = if series.is_empty() && references.is_empty() {
-        y
-    } else {
-        y + 50
-    };
+    let below = if series.is_empty() && references.is_empty() { y } else { y + 50 };
     Ok(area.split_vertically(below).1)
 }
 
@@ -255,10 +205,7 @@ pub(super) fn mesh<DB: DrawingBackend>(
 }
 
 /// Horizontal dashed lines over the whole width of a chart.
-pub(super) fn draw_references<DB: DrawingBackend>(
-    chart: &mut Chart<'_, DB>,
-    references: &[Reference],
-) -> Drawn<DB> {
+pub(super) fn draw_references<DB: DrawingBackend>(chart: &mut Chart<'_, DB>, references: &[Reference]) -> Drawn<DB> {
     let across = chart.x_range();
     for (index, line) in references.iter().enumerate() {
         let ends = [(across.start, line.value), (across.end, line.value)];

@@ -18,12 +18,7 @@ pub struct AdamConfig {
 impl AdamConfig {
     /// PyTorch's defaults at this learning rate.
     pub fn new(learning_rate: f32) -> Self {
-        Self {
-            learning_rate,
-            beta1: 0.9,
-            beta2: 0.999,
-            epsilon: 1e-8,
-        }
+        Self { learning_rate, beta1: 0.9, beta2: 0.999, epsilon: 1e-8 }
     }
 }
 
@@ -43,33 +38,18 @@ pub struct Adam {
 impl Adam {
     /// A fresh state for `parameters` parameters.
     pub fn new(config: AdamConfig, parameters: usize) -> Self {
-        Self {
-            config,
-            m: vec![0.0; parameters],
-            v: vec![0.0; parameters],
-            t: 0,
-        }
+        Self { config, m: vec![0.0; parameters], v: vec![0.0; parameters], t: 0 }
     }
 
     /// One step down the gradient, in place.
     pub fn step(&mut self, params: &mut [f32], grads: &[f32]) {
         self.t += 1;
-        let AdamConfig {
-            learning_rate,
-            beta1,
-            beta2,
-            epsilon,
-        } = self.config;
+        let AdamConfig { learning_rate, beta1, beta2, epsilon } = self.config;
         let power = self.t as f64;
         let correct1 = 1.0 - libm::pow(f64::from(beta1), power);
         let root2 = libm::sqrt(1.0 - libm::pow(f64::from(beta2), power)) as f32;
         let step = (f64::from(learning_rate) / correct1) as f32;
-        for (((p, g), m), v) in params
-            .iter_mut()
-            .zip(grads)
-            .zip(&mut self.m)
-            .zip(&mut self.v)
-        {
+        for (((p, g), m), v) in params.iter_mut().zip(grads).zip(&mut self.m).zip(&mut self.v) {
             *m = beta1 * *m + (1.0 - beta1) * g;
             *v = beta2 * *v + (1.0 - beta2) * g * g;
             *p -= step * *m / (v.sqrt() / root2 + epsilon);
@@ -79,11 +59,7 @@ impl Adam {
 
 /// Scales `grads` so that their L2 norm is at most `limit`; returns the norm before.
 pub fn clip_norm(grads: &mut [f32], limit: f32) -> f32 {
-    let norm = grads
-        .iter()
-        .map(|&g| f64::from(g) * f64::from(g))
-        .sum::<f64>()
-        .sqrt() as f32;
+    let norm = grads.iter().map(|&g| f64::from(g) * f64::from(g)).sum::<f64>().sqrt() as f32;
     if norm > limit {
         let scale = limit / (norm + 1e-6);
         grads.iter_mut().for_each(|g| *g *= scale);
@@ -93,10 +69,7 @@ pub fn clip_norm(grads: &mut [f32], limit: f32) -> f32 {
 
 /// `target ← (1 − tau) target + tau source`.
 pub fn soft_update(target: &mut [f32], source: &[f32], tau: f32) {
-    target
-        .iter_mut()
-        .zip(source)
-        .for_each(|(t, s)| *t += tau * (s - *t));
+    target.iter_mut().zip(source).for_each(|(t, s)| *t += tau * (s - *t));
 }
 
 #[cfg(test)]

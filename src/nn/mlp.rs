@@ -88,15 +88,8 @@ fn grow(buffer: &mut Vec<f32>, len: usize) -> &mut [f32] {
 impl Mlp {
     /// A perceptron of these widths: inputs, hidden layers, outputs.
     pub fn new(widths: &[usize], hidden: Activation, output: Activation) -> Self {
-        assert!(
-            widths.len() >= 2 && widths.iter().all(|&w| w > 0),
-            "a perceptron needs positive widths"
-        );
-        Self {
-            widths: widths.to_vec(),
-            hidden,
-            output,
-        }
+        assert!(widths.len() >= 2 && widths.iter().all(|&w| w > 0), "a perceptron needs positive widths");
+        Self { widths: widths.to_vec(), hidden, output }
     }
 
     /// Width of the input.
@@ -116,9 +109,7 @@ impl Mlp {
 
     /// Shape `[outputs, inputs]` of layer `layer`'s weight and where it starts in the flat parameters.
     pub fn weight(&self, layer: usize) -> ([usize; 2], usize) {
-        let offset = (0..layer)
-            .map(|l| self.widths[l + 1] * (self.widths[l] + 1))
-            .sum();
+        let offset = (0..layer).map(|l| self.widths[l + 1] * (self.widths[l] + 1)).sum();
         ([self.widths[layer + 1], self.widths[layer]], offset)
     }
 
@@ -128,11 +119,7 @@ impl Mlp {
     }
 
     fn activation(&self, layer: usize) -> Activation {
-        if layer + 1 == self.layers() {
-            self.output
-        } else {
-            self.hidden
-        }
+        if layer + 1 == self.layers() { self.output } else { self.hidden }
     }
 
     /// Appends fresh parameters: U(−1/√inputs, 1/√inputs) for weights and biases, PyTorch's default for `Linear`.
@@ -140,20 +127,12 @@ impl Mlp {
         for layer in 0..self.layers() {
             let ([outputs, inputs], _) = self.weight(layer);
             let bound = 1.0 / libm::sqrt(inputs as f64);
-            out.extend(
-                (0..outputs * (inputs + 1)).map(|_| rng::uniform(rng, -bound, bound) as f32),
-            );
+            out.extend((0..outputs * (inputs + 1)).map(|_| rng::uniform(rng, -bound, bound) as f32));
         }
     }
 
     /// Forward pass of `[rows, inputs]`; the output stays in the tape.
-    pub fn forward<'t>(
-        &self,
-        params: &[f32],
-        input: &[f32],
-        rows: usize,
-        tape: &'t mut Tape,
-    ) -> &'t [f32] {
+    pub fn forward<'t>(&self, params: &[f32], input: &[f32], rows: usize, tape: &'t mut Tape) -> &'t [f32] {
         assert!(params.len() >= self.parameters() && input.len() >= rows * self.inputs());
         tape.rows = rows;
         tape.activations.resize_with(self.layers(), Vec::new);
@@ -232,10 +211,8 @@ impl Mlp {
                 if layer + 1 == layers {
                     let given = &grad_output[start * outputs..end * outputs];
                     let delta = grow(&mut delta, n * width);
-                    for ((d, g), y) in delta
-                        .chunks_exact_mut(width)
-                        .zip(given.chunks_exact(outputs))
-                        .zip(y.chunks_exact(outputs))
+                    for ((d, g), y) in
+                        delta.chunks_exact_mut(width).zip(given.chunks_exact(outputs)).zip(y.chunks_exact(outputs))
                     {
                         for o in 0..outputs {
                             d[o] = g[o] * activation.slope(y[o]);
@@ -245,25 +222,18 @@ impl Mlp {
                 } else {
                     slope_in_place(&mut delta[..n * outputs], y, activation);
                 }
-                let x = if layer == 0 {
-                    input
-                } else {
-                    &tape.activations[layer - 1]
-                };
+                let x = if layer == 0 { input } else { &tape.activations[layer - 1] };
                 let x = &x[start * inputs..end * inputs];
                 if !grads.is_empty() {
-                    let (grad_weight, grad_bias) = grads[offset..offset + outputs * (inputs + 1)]
-                        .split_at_mut(outputs * inputs);
+                    let (grad_weight, grad_bias) =
+                        grads[offset..offset + outputs * (inputs + 1)].split_at_mut(outputs * inputs);
                     let d = View::new(&delta, n, width);
                     if width == outputs {
                         multiply(d.t(), View::new(x, n, inputs), grad_weight, true);
                     } else {
                         let wide = grow(&mut tape.padded_grad, width * inputs);
                         multiply(d.t(), View::new(x, n, inputs), wide, false);
-                        grad_weight
-                            .iter_mut()
-                            .zip(wide.iter())
-                            .for_each(|(g, w)| *g += w);
+                        grad_weight.iter_mut().zip(wide.iter()).for_each(|(g, w)| *g += w);
                     }
                     for d in delta[..n * width].chunks_exact(width) {
                         grad_bias.iter_mut().zip(d).for_each(|(g, d)| *g += d);
@@ -278,22 +248,12 @@ impl Mlp {
                 };
                 let weight = &params[offset..offset + outputs * inputs];
                 if width == outputs {
-                    multiply(
-                        View::new(&delta, n, width),
-                        View::new(weight, outputs, inputs),
-                        target,
-                        false,
-                    );
+                    multiply(View::new(&delta, n, width), View::new(weight, outputs, inputs), target, false);
                 } else {
                     let wide = grow(&mut tape.padded_weight, width * inputs);
                     wide[..outputs * inputs].copy_from_slice(weight);
                     wide[outputs * inputs..].fill(0.0);
-                    multiply(
-                        View::new(&delta, n, width),
-                        View::new(wide, width, inputs),
-                        target,
-                        false,
-                    );
+                    multiply(View::new(&delta, n, width), View::new(wide, width, inputs), target, false);
                 }
                 if layer > 0 {
                     std::mem::swap(&mut delta, &mut next);
@@ -307,9 +267,7 @@ impl Mlp {
 /// Adds the bias and applies the activation, row by row.
 fn finish(y: &mut [f32], bias: &[f32], activation: impl Fn(f32) -> f32) {
     for row in y.chunks_exact_mut(bias.len()) {
-        row.iter_mut()
-            .zip(bias)
-            .for_each(|(y, b)| *y = activation(*y + b));
+        row.iter_mut().zip(bias).for_each(|(y, b)| *y = activation(*y + b));
     }
 }
 
@@ -317,14 +275,8 @@ fn finish(y: &mut [f32], bias: &[f32], activation: impl Fn(f32) -> f32) {
 fn slope_in_place(delta: &mut [f32], y: &[f32], activation: Activation) {
     match activation {
         Activation::Identity => {}
-        Activation::Relu => delta
-            .iter_mut()
-            .zip(y)
-            .for_each(|(d, &y)| *d = if y > 0.0 { *d } else { 0.0 }),
-        other => delta
-            .iter_mut()
-            .zip(y)
-            .for_each(|(d, &y)| *d *= other.slope(y)),
+        Activation::Relu => delta.iter_mut().zip(y).for_each(|(d, &y)| *d = if y > 0.0 { *d } else { 0.0 }),
+        other => delta.iter_mut().zip(y).for_each(|(d, &y)| *d *= other.slope(y)),
     }
 }
 
@@ -338,10 +290,8 @@ mod tests {
     /// Forward, parameter gradients and input gradients of Σ w·output by candle's autograd.
     fn reference(mlp: &Mlp, params: &[f32], x: &[f32], rows: usize, w: &[f32]) -> [Vec<f32>; 3] {
         let dev = &Device::Cpu;
-        let vars =
-            Var::from_tensor(&Tensor::from_slice(params, params.len(), dev).unwrap()).unwrap();
-        let x =
-            Var::from_tensor(&Tensor::from_slice(x, (rows, mlp.inputs()), dev).unwrap()).unwrap();
+        let vars = Var::from_tensor(&Tensor::from_slice(params, params.len(), dev).unwrap()).unwrap();
+        let x = Var::from_tensor(&Tensor::from_slice(x, (rows, mlp.inputs()), dev).unwrap()).unwrap();
         let mut h = x.as_tensor().clone();
         for layer in 0..mlp.layers() {
             let ([o, i], at) = mlp.weight(layer);
@@ -359,19 +309,8 @@ mod tests {
         let w = Tensor::from_slice(w, (rows, mlp.outputs()), dev).unwrap();
         let loss = (&h * w).unwrap().sum(D::Minus1).unwrap().sum_all().unwrap();
         let grads = loss.backward().unwrap();
-        let flat = |t: &Tensor| {
-            t.flatten_all()
-                .unwrap()
-                .to_dtype(DType::F32)
-                .unwrap()
-                .to_vec1()
-                .unwrap()
-        };
-        [
-            flat(&h),
-            flat(grads.get(&vars).unwrap()),
-            flat(grads.get(&x).unwrap()),
-        ]
+        let flat = |t: &Tensor| t.flatten_all().unwrap().to_dtype(DType::F32).unwrap().to_vec1().unwrap();
+        [flat(&h), flat(grads.get(&vars).unwrap()), flat(grads.get(&x).unwrap())]
     }
 
     #[test]
@@ -389,11 +328,7 @@ mod tests {
             let mut rng = Seeds::new(case as u64).stream("mlp");
             let mut params = Vec::new();
             mlp.init(&mut rng, &mut params);
-            let mut draw = |n: usize| {
-                (0..n)
-                    .map(|_| rng::normal(&mut rng) as f32)
-                    .collect::<Vec<_>>()
-            };
+            let mut draw = |n: usize| (0..n).map(|_| rng::normal(&mut rng) as f32).collect::<Vec<_>>();
             let (x, w) = (draw(rows * mlp.inputs()), draw(rows * mlp.outputs()));
             let [y, grad_params, grad_x] = reference(&mlp, &params, &x, rows, &w);
             let mut tape = Tape::default();
@@ -401,14 +336,7 @@ mod tests {
                 let mut grads = vec![0.0; mlp.parameters()];
                 let mut grad_input = vec![0.0; x.len()];
                 close(mlp.forward(&params, &x, rows, &mut tape), &y);
-                mlp.backward(
-                    &params,
-                    &x,
-                    &mut tape,
-                    &w,
-                    &mut grads,
-                    Some(&mut grad_input),
-                );
+                mlp.backward(&params, &x, &mut tape, &w, &mut grads, Some(&mut grad_input));
                 close(&grads, &grad_params);
                 close(&grad_input, &grad_x);
             }
@@ -418,11 +346,7 @@ mod tests {
     fn close(a: &[f32], b: &[f32]) {
         assert_eq!(a.len(), b.len());
         let scale = b.iter().fold(1.0f32, |m, v| m.max(v.abs()));
-        let worst = a
-            .iter()
-            .zip(b)
-            .map(|(a, b)| (a - b).abs())
-            .fold(0.0, f32::max);
+        let worst = a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(worst <= 1e-5 * scale, "differs by {worst} at scale {scale}");
     }
 }

@@ -59,10 +59,7 @@ impl Params {
     /// [`NnError::Candle`] when candle refuses the allocation.
     pub fn new(values: Vec<f32>) -> Result<Self, NnError> {
         let len = values.len();
-        Ok(Self {
-            var: Var::from_tensor(&Tensor::from_vec(values, len, &Device::Cpu)?)?,
-            len,
-        })
+        Ok(Self { var: Var::from_tensor(&Tensor::from_vec(values, len, &Device::Cpu)?)?, len })
     }
 
     /// Number of parameters.
@@ -77,9 +74,7 @@ impl Params {
 
     /// The parameters as a slice, for as long as the guard lives.
     pub fn read(&self) -> ParamsRef<'_> {
-        ParamsRef {
-            storage: self.var.storage_and_layout().0,
-        }
+        ParamsRef { storage: self.var.storage_and_layout().0 }
     }
 
     /// Changes the parameters in place.
@@ -111,17 +106,10 @@ pub fn to_tensors(
 ) -> Result<(), NnError> {
     for layer in 0..mlp.layers() {
         let ([outputs, inputs], at) = mlp.weight(layer);
-        let weight = Tensor::from_slice(
-            &params[at..at + outputs * inputs],
-            (outputs, inputs),
-            &Device::Cpu,
-        )?;
+        let weight = Tensor::from_slice(&params[at..at + outputs * inputs], (outputs, inputs), &Device::Cpu)?;
         let bias = &params[at + outputs * inputs..at + outputs * (inputs + 1)];
         out.insert(format!("{prefix}.{layer}.weight"), weight);
-        out.insert(
-            format!("{prefix}.{layer}.bias"),
-            Tensor::from_slice(bias, outputs, &Device::Cpu)?,
-        );
+        out.insert(format!("{prefix}.{layer}.bias"), Tensor::from_slice(bias, outputs, &Device::Cpu)?);
     }
     Ok(())
 }
@@ -130,20 +118,11 @@ pub fn to_tensors(
 ///
 /// # Errors
 /// [`NnError::Candle`] that names the tensor and both shapes.
-pub fn from_tensors(
-    builder: &VarBuilder<'_>,
-    prefix: &str,
-    mlp: &Mlp,
-    out: &mut Vec<f32>,
-) -> Result<(), NnError> {
+pub fn from_tensors(builder: &VarBuilder<'_>, prefix: &str, mlp: &Mlp, out: &mut Vec<f32>) -> Result<(), NnError> {
     for layer in 0..mlp.layers() {
         let ([outputs, inputs], _) = mlp.weight(layer);
         let part = builder.pp(prefix).pp(layer);
-        out.extend(
-            part.get((outputs, inputs), "weight")?
-                .flatten_all()?
-                .to_vec1::<f32>()?,
-        );
+        out.extend(part.get((outputs, inputs), "weight")?.flatten_all()?.to_vec1::<f32>()?);
         out.extend(part.get(outputs, "bias")?.to_vec1::<f32>()?);
     }
     Ok(())
@@ -158,18 +137,12 @@ mod tests {
     fn parameters_change_in_place_and_survive_a_round_trip_by_name() {
         let mlp = Mlp::new(&[3, 4, 2], Activation::Relu, Activation::Tanh);
         let params = Params::new((0..mlp.parameters()).map(|i| i as f32).collect()).unwrap();
-        params
-            .update(|p| p.iter_mut().for_each(|v| *v *= 2.0))
-            .unwrap();
+        params.update(|p| p.iter_mut().for_each(|v| *v *= 2.0)).unwrap();
         assert_eq!(params.read()[3], 6.0);
         let mut named = BTreeMap::new();
         to_tensors("actor", &mlp, &params.read(), &mut named).unwrap();
         assert_eq!(named["actor.0.weight"].dims(), [4, 3]);
-        let builder = VarBuilder::from_tensors(
-            named.into_iter().collect(),
-            candle_core::DType::F32,
-            &Device::Cpu,
-        );
+        let builder = VarBuilder::from_tensors(named.into_iter().collect(), candle_core::DType::F32, &Device::Cpu);
         let mut flat = Vec::new();
         from_tensors(&builder, "actor", &mlp, &mut flat).unwrap();
         assert_eq!(flat, *params.read());

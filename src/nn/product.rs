@@ -1,8 +1,5 @@
 //! f32 matrix products on one thread, row-major, through the `gemm` crate (kernel chosen at run time by the CPU).
-#![expect(
-    unsafe_code,
-    reason = "gemm's entry point takes raw pointers; bounds are checked here before the call"
-)]
+#![expect(unsafe_code, reason = "gemm's entry point takes raw pointers; bounds are checked here before the call")]
 
 use gemm::Parallelism;
 
@@ -19,18 +16,8 @@ pub(super) struct View<'a> {
 impl<'a> View<'a> {
     /// A dense row-major `rows × cols` matrix.
     pub(super) fn new(data: &'a [f32], rows: usize, cols: usize) -> Self {
-        assert!(
-            data.len() >= rows * cols,
-            "matrix of {rows} × {cols} over {} elements",
-            data.len()
-        );
-        Self {
-            data,
-            rows,
-            cols,
-            row_stride: cols,
-            col_stride: 1,
-        }
+        assert!(data.len() >= rows * cols, "matrix of {rows} × {cols} over {} elements", data.len());
+        Self { data, rows, cols, row_stride: cols, col_stride: 1 }
     }
 
     /// The same matrix transposed.
@@ -49,11 +36,7 @@ impl<'a> View<'a> {
 pub(super) fn multiply(a: View<'_>, b: View<'_>, out: &mut [f32], accumulate: bool) {
     let (m, n, k) = (a.rows, b.cols, a.cols);
     assert_eq!(k, b.rows, "inner dimensions of a product");
-    assert!(
-        out.len() >= m * n,
-        "product of {m} × {n} into {} elements",
-        out.len()
-    );
+    assert!(out.len() >= m * n, "product of {m} × {n} into {} elements", out.len());
     if m == 0 || n == 0 {
         return;
     }
@@ -93,12 +76,7 @@ mod tests {
         let a: Vec<f32> = (0..6).map(|i| i as f32).collect();
         let b: Vec<f32> = (0..12).map(|i| 1.0 - i as f32).collect();
         let mut out = vec![f32::NAN; 8];
-        multiply(
-            View::new(&a, 2, 3),
-            View::new(&b, 4, 3).t(),
-            &mut out,
-            false,
-        );
+        multiply(View::new(&a, 2, 3), View::new(&b, 4, 3).t(), &mut out, false);
         for i in 0..2 {
             for j in 0..4 {
                 let expected: f32 = (0..3).map(|k| a[i * 3 + k] * b[j * 3 + k]).sum();

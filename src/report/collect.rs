@@ -15,19 +15,8 @@ use crate::report::mutual::{self, MutualFile};
 const DEPTH: usize = 3;
 
 /// Configuration keys that do not make two trainings different: where they go, and the seed.
-const NOT_SETTINGS: [&str; 11] = [
-    "ccmarl",
-    "seed",
-    "log_every",
-    "out",
-    "force",
-    "resume",
-    "record",
-    "threads",
-    "name",
-    "title",
-    "warm_start",
-];
+const NOT_SETTINGS: [&str; 11] =
+    ["ccmarl", "seed", "log_every", "out", "force", "resume", "record", "threads", "name", "title", "warm_start"];
 
 /// What runs must share to stand in one table: returns of different tasks are not comparable.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -42,11 +31,7 @@ pub struct Task {
 
 impl std::fmt::Display for Task {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(
-            f,
-            "{}, {} agents, profile {}",
-            self.scenario, self.agents, self.profile
-        )
+        write!(f, "{}, {} agents, profile {}", self.scenario, self.agents, self.profile)
     }
 }
 
@@ -106,10 +91,7 @@ impl Collected {
         for run in &self.runs {
             tasks.entry(&run.task).or_insert(&run.scenario);
         }
-        tasks
-            .into_iter()
-            .map(|(task, spec)| (task.clone(), spec.clone()))
-            .collect()
+        tasks.into_iter().map(|(task, spec)| (task.clone(), spec.clone())).collect()
     }
 }
 
@@ -182,9 +164,7 @@ fn find_runs(path: &Path, depth: usize, found: &mut Vec<PathBuf>) -> Result<(), 
         found.push(path.to_owned());
     } else if depth > 0 && path.is_dir() {
         for child in list(path)? {
-            let hidden = child
-                .file_name()
-                .is_some_and(|n| n.to_string_lossy().starts_with('.'));
+            let hidden = child.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.'));
             if child.is_dir() && !hidden {
                 find_runs(&child, depth - 1, found)?;
             }
@@ -207,11 +187,7 @@ fn expand(pattern: &Path) -> Result<Vec<PathBuf>, ReportError> {
         }
         let mut next = Vec::new();
         for path in &paths {
-            let dir = if path.as_os_str().is_empty() {
-                Path::new(".")
-            } else {
-                path.as_path()
-            };
+            let dir = if path.as_os_str().is_empty() { Path::new(".") } else { path.as_path() };
             if !dir.is_dir() {
                 continue;
             }
@@ -254,12 +230,7 @@ fn read_run(path: &Path) -> Result<Run, ReportError> {
     let config_path = path.join("config.toml");
     let text = read_text(&config_path, 1 << 20)?;
     let broken = |message: String| ReportError::Config {
-        message: message
-            .lines()
-            .collect::<Vec<_>>()
-            .join(" ")
-            .trim()
-            .to_owned(),
+        message: message.lines().collect::<Vec<_>>().join(" ").trim().to_owned(),
         path: config_path.clone(),
     };
     let config: Config = toml::from_str(&text).map_err(|e| broken(e.message().to_owned()))?;
@@ -267,29 +238,15 @@ fn read_run(path: &Path) -> Result<Run, ReportError> {
     let mut settings = BTreeMap::new();
     flatten("", &toml::Value::Table(raw), &mut settings);
     settings.retain(|key, _| !NOT_SETTINGS.contains(&key.as_str()));
-    let profile = config
-        .scenario
-        .params
-        .get("profile")
-        .and_then(|v| v.as_str())
-        .unwrap_or("paper")
-        .to_owned();
-    let agents = config
-        .scenario
-        .params
-        .get("agents")
-        .and_then(serde_json::Value::as_i64);
+    let profile = config.scenario.params.get("profile").and_then(|v| v.as_str()).unwrap_or("paper").to_owned();
+    let agents = config.scenario.params.get("agents").and_then(serde_json::Value::as_i64);
     let mut run = Run {
         path: path.to_owned(),
         ccmarl: config.ccmarl,
         seed: config.seed,
         steps: config.steps,
         algorithm: config.algorithm,
-        task: Task {
-            scenario: config.scenario.name.clone(),
-            profile,
-            agents: agents.unwrap_or(0),
-        },
+        task: Task { scenario: config.scenario.name.clone(), profile, agents: agents.unwrap_or(0) },
         scenario: config.scenario,
         prior: config.prior,
         config_sha256: sha256_file(&config_path)?.0,
@@ -297,10 +254,7 @@ fn read_run(path: &Path) -> Result<Run, ReportError> {
         training: Vec::new(),
         episodes: Vec::new(),
     };
-    let (metrics, evaluation) = (
-        path.join("metrics.parquet"),
-        path.join("evaluation.parquet"),
-    );
+    let (metrics, evaluation) = (path.join("metrics.parquet"), path.join("evaluation.parquet"));
     if !metrics.exists() && !evaluation.exists() {
         return Err(ReportError::EmptyRun(path.to_owned()));
     }
@@ -316,11 +270,7 @@ fn read_run(path: &Path) -> Result<Run, ReportError> {
 fn flatten(prefix: &str, value: &toml::Value, out: &mut BTreeMap<String, String>) {
     if let toml::Value::Table(table) = value {
         for (key, value) in table {
-            let name = if prefix.is_empty() {
-                key.clone()
-            } else {
-                format!("{prefix}.{key}")
-            };
+            let name = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
             flatten(&name, value, out);
         }
     } else {
@@ -330,14 +280,9 @@ fn flatten(prefix: &str, value: &toml::Value, out: &mut BTreeMap<String, String>
 
 fn read_training(path: &Path, run: &mut Run) -> Result<(), ReportError> {
     let table = Columns::open(path)?;
-    let rows = table
-        .whole("step")?
-        .into_iter()
-        .zip(table.numbers_or_null("return_mean")?);
+    let rows = table.whole("step")?.into_iter().zip(table.numbers_or_null("return_mean")?);
     // intervals in which no episode ended have no return
-    run.training = rows
-        .filter_map(|(step, value)| Some((step, value.filter(|v| v.is_finite())?)))
-        .collect();
+    run.training = rows.filter_map(|(step, value)| Some((step, value.filter(|v| v.is_finite())?))).collect();
     Ok(())
 }
 
@@ -350,10 +295,9 @@ fn read_evaluation(path: &Path, run: &mut Run) -> Result<(), ReportError> {
         path: run.path.clone(),
     };
     let agents = table.whole("agents")?;
-    for (what, column, config) in [
-        ("scenario", "scenario", &run.task.scenario),
-        ("algorithm", "algorithm", &run.algorithm),
-    ] {
+    for (what, column, config) in
+        [("scenario", "scenario", &run.task.scenario), ("algorithm", "algorithm", &run.algorithm)]
+    {
         if let Some(other) = table.text(column)?.iter().find(|v| *v != config) {
             return Err(differs(what, config, other));
         }
@@ -365,20 +309,10 @@ fn read_evaluation(path: &Path, run: &mut Run) -> Result<(), ReportError> {
     if let Some(other) = agents.iter().find(|&&n| n != agents[0]) {
         return Err(differs("agents", &agents[0].to_string(), &other.to_string()));
     }
-    let (channels, values, losses) = (
-        table.text("channel")?,
-        table.finite("return")?,
-        table.finite("loss_rate")?,
-    );
+    let (channels, values, losses) = (table.text("channel")?, table.finite("return")?, table.finite("loss_rate")?);
     run.task.agents = agents[0];
     let rows = channels.into_iter().zip(values).zip(losses);
-    run.episodes = rows
-        .map(|((channel, value), loss_rate)| TestEpisode {
-            channel,
-            value,
-            loss_rate,
-        })
-        .collect();
+    run.episodes = rows.map(|((channel, value), loss_rate)| TestEpisode { channel, value, loss_rate }).collect();
     Ok(())
 }
 
@@ -389,48 +323,26 @@ mod tests {
     #[test]
     fn stars_stand_for_any_characters() {
         assert!(matches("cc-*", "cc-maddpg-1") && matches("*", "x") && matches("a*b*c", "a1b2c"));
-        assert!(
-            !matches("cc-*", "fc-maddpg") && !matches("a*b*c", "acb") && !matches("ab*ba", "aba")
-        );
+        assert!(!matches("cc-*", "fc-maddpg") && !matches("a*b*c", "acb") && !matches("ab*ba", "aba"));
     }
 
     #[test]
     fn settings_are_flat_and_leave_out_seed_and_places() {
         let mut flat = BTreeMap::new();
-        flatten(
-            "",
-            &toml::Value::Table(toml::from_str("a = 1\n[dumie]\nalpha = 0.5").unwrap()),
-            &mut flat,
-        );
+        flatten("", &toml::Value::Table(toml::from_str("a = 1\n[dumie]\nalpha = 0.5").unwrap()), &mut flat);
         assert_eq!(
             flat.into_iter().collect::<Vec<_>>(),
-            [
-                ("a".into(), "1".into()),
-                ("dumie.alpha".into(), "0.5".into())
-            ]
+            [("a".into(), "1".into()), ("dumie.alpha".into(), "0.5".into())]
         );
     }
 
     #[test]
     fn a_directory_without_runs_is_named() {
         let dir = tempfile::tempdir().unwrap();
-        let error = collect(&[dir.path().to_owned()], &[])
-            .unwrap_err()
-            .to_string();
-        assert!(
-            error.starts_with("expected a run directory (with config.toml)"),
-            "{error}"
-        );
-        let missing = collect(&[dir.path().join("x")], &[])
-            .unwrap_err()
-            .to_string();
-        assert!(
-            missing.starts_with("no such file or directory: "),
-            "{missing}"
-        );
-        assert_eq!(
-            collect(&[], &[]).unwrap_err().to_string(),
-            "nothing to report: give run directories, or --mi FILE"
-        );
+        let error = collect(&[dir.path().to_owned()], &[]).unwrap_err().to_string();
+        assert!(error.starts_with("expected a run directory (with config.toml)"), "{error}");
+        let missing = collect(&[dir.path().join("x")], &[]).unwrap_err().to_string();
+        assert!(missing.starts_with("no such file or directory: "), "{missing}");
+        assert_eq!(collect(&[], &[]).unwrap_err().to_string(), "nothing to report: give run directories, or --mi FILE");
     }
 }

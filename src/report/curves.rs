@@ -24,16 +24,8 @@ pub(super) struct Curves {
 /// # Errors
 /// [`ReportError::Duplicate`].
 pub(super) fn curves(runs: &[&Run]) -> Result<Option<Curves>, ReportError> {
-    let trained: Vec<&Run> = runs
-        .iter()
-        .copied()
-        .filter(|r| !r.training.is_empty())
-        .collect();
-    let last = trained
-        .iter()
-        .flat_map(|r| r.training.iter().map(|t| t.0))
-        .max()
-        .unwrap_or(0);
+    let trained: Vec<&Run> = runs.iter().copied().filter(|r| !r.training.is_empty()).collect();
+    let last = trained.iter().flat_map(|r| r.training.iter().map(|t| t.0)).max().unwrap_or(0);
     let Some(rows) = trained.iter().map(|r| r.training.len()).min() else {
         return Ok(None);
     };
@@ -43,66 +35,33 @@ pub(super) fn curves(runs: &[&Run]) -> Result<Option<Curves>, ReportError> {
     let mut ends = Vec::new();
     let mut bands = false;
     for (series, group) in returns::series(&trained)? {
-        let runs: Vec<Vec<Option<f64>>> = group
-            .iter()
-            .map(|r| windows(&r.training, window, count))
-            .collect();
+        let runs: Vec<Vec<Option<f64>>> = group.iter().map(|r| windows(&r.training, window, count)).collect();
         let middle = |k: usize| (k as f64 + 0.5) * window;
         if runs.len() >= 3 {
             bands = true;
             let points = (0..count).filter_map(|k| {
                 let values: Vec<f64> = runs.iter().filter_map(|r| r[k]).collect();
                 let band = t_interval(&values, 0.95).filter(|_| values.len() == runs.len())?;
-                Some(Point {
-                    step: middle(k),
-                    value: mean(&values),
-                    band: Some((band.low, band.high)),
-                })
+                Some(Point { step: middle(k), value: mean(&values), band: Some((band.low, band.high)) })
             });
-            all.push(Curve {
-                series: series.clone(),
-                points: points.collect(),
-            });
+            all.push(Curve { series: series.clone(), points: points.collect() });
         } else {
             for run in &runs {
-                let points = run.iter().enumerate().filter_map(|(k, value)| {
-                    Some(Point {
-                        step: middle(k),
-                        value: (*value)?,
-                        band: None,
-                    })
-                });
-                all.push(Curve {
-                    series: series.clone(),
-                    points: points.collect(),
-                });
+                let points = run
+                    .iter()
+                    .enumerate()
+                    .filter_map(|(k, value)| Some(Point { step: middle(k), value: (*value)?, band: None }));
+                all.push(Curve { series: series.clone(), points: points.collect() });
             }
         }
         let tail = |run: &&Run| {
             let from = run.training.last().map_or(0.0, |t| 0.9 * t.0 as f64);
-            mean(
-                &run.training
-                    .iter()
-                    .filter(|t| t.0 as f64 >= from)
-                    .map(|t| t.1)
-                    .collect::<Vec<_>>(),
-            )
+            mean(&run.training.iter().filter(|t| t.0 as f64 >= from).map(|t| t.1).collect::<Vec<_>>())
         };
-        ends.push(format!(
-            "{series} {:.1}",
-            mean(&group.iter().map(tail).collect::<Vec<_>>())
-        ));
+        ends.push(format!("{series} {:.1}", mean(&group.iter().map(tail).collect::<Vec<_>>())));
     }
-    let seen = format!(
-        "Mean return with exploration noise over the last tenth of training: {}.",
-        ends.join("; ")
-    );
-    Ok(Some(Curves {
-        curves: all,
-        window,
-        bands,
-        seen,
-    }))
+    let seen = format!("Mean return with exploration noise over the last tenth of training: {}.", ends.join("; "));
+    Ok(Some(Curves { curves: all, window, bands, seen }))
 }
 
 /// Mean of the logged returns in each of `count` windows.
@@ -114,9 +73,7 @@ fn windows(training: &[(i64, f64)], window: f64, count: usize) -> Vec<Option<f64
         sums[place].0 += value;
         sums[place].1 += 1;
     }
-    sums.into_iter()
-        .map(|(sum, n)| (n > 0).then(|| sum / n as f64))
-        .collect()
+    sums.into_iter().map(|(sum, n)| (n > 0).then(|| sum / n as f64)).collect()
 }
 
 #[cfg(test)]
@@ -146,10 +103,7 @@ mod tests {
         };
         let three = seeds(3);
         let result = curves(&three.iter().collect::<Vec<_>>()).unwrap().unwrap();
-        assert_eq!(
-            (result.curves.len(), result.bands, result.window),
-            (1, true, 100.0)
-        );
+        assert_eq!((result.curves.len(), result.bands, result.window), (1, true, 100.0));
         let point = result.curves[0].points[0];
         assert_eq!((point.step, point.value), (50.0, 1.0));
         assert!((point.band.unwrap().1 - 1.0 - 4.302652729696142 / 3.0_f64.sqrt()).abs() < 1e-9);

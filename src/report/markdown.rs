@@ -24,19 +24,11 @@ fn plain(text: impl Into<String>) -> (String, bool) {
 
 /// The returns table, three lines per algorithm that has published cells (ours, published, difference).
 pub(super) fn grid(returns: &Returns) -> Grid {
-    let mut header = vec![
-        "algorithm".to_owned(),
-        "what".to_owned(),
-        "seeds".to_owned(),
-    ];
+    let mut header = vec!["algorithm".to_owned(), "what".to_owned(), "seeds".to_owned()];
     header.extend(returns.channels.iter().cloned());
     let mut lines = Vec::new();
     for row in &returns.rows {
-        let mut ours = vec![
-            plain(&row.series),
-            plain("ours"),
-            plain(row.seeds.len().to_string()),
-        ];
+        let mut ours = vec![plain(&row.series), plain("ours"), plain(row.seeds.len().to_string())];
         let mut published = vec![plain(""), plain("published"), plain("1")];
         let mut difference = vec![plain(""), plain("ours − published"), plain("")];
         for cell in &row.cells {
@@ -46,74 +38,34 @@ pub(super) fn grid(returns: &Returns) -> Grid {
                 }
                 continue;
             };
-            ours.push((
-                format!("{:.1} ± {:.1}", cell.mean, cell.spread()),
-                cell.best,
-            ));
-            published
-                .push(plain(cell.published.map_or("–".to_owned(), |p| {
-                    format!("{:.1} ± {:.1}", p.mean, p.sd)
-                })));
-            difference
-                .push(plain(cell.published.map_or("–".to_owned(), |p| {
-                    format!("{:+.1}", cell.mean - p.mean)
-                })));
+            ours.push((format!("{:.1} ± {:.1}", cell.mean, cell.spread()), cell.best));
+            published.push(plain(cell.published.map_or("–".to_owned(), |p| format!("{:.1} ± {:.1}", p.mean, p.sd))));
+            difference.push(plain(cell.published.map_or("–".to_owned(), |p| format!("{:+.1}", cell.mean - p.mean))));
         }
-        lines.push(Line {
-            kind: "ours",
-            cells: ours,
-        });
+        lines.push(Line { kind: "ours", cells: ours });
         if row.cells.iter().flatten().any(|c| c.published.is_some()) {
-            lines.push(Line {
-                kind: "published",
-                cells: published,
-            });
-            lines.push(Line {
-                kind: "difference",
-                cells: difference,
-            });
+            lines.push(Line { kind: "published", cells: published });
+            lines.push(Line { kind: "difference", cells: difference });
         }
     }
     for &(name, mean, sd, _) in &returns.references {
         let mut cells = vec![plain(name), plain("reference"), plain("")];
-        cells.extend(
-            returns
-                .channels
-                .iter()
-                .map(|_| plain(format!("{mean:.1} ± {sd:.1}"))),
-        );
-        lines.push(Line {
-            kind: "reference",
-            cells,
-        });
+        cells.extend(returns.channels.iter().map(|_| plain(format!("{mean:.1} ± {sd:.1}"))));
+        lines.push(Line { kind: "reference", cells });
     }
     let mut losses = vec![plain("messages lost"), plain("realised"), plain("")];
     for column in 0..returns.channels.len() {
-        let cells: Vec<f64> = returns
-            .rows
-            .iter()
-            .filter_map(|r| r.cells[column].as_ref())
-            .map(|c| c.loss_rate)
-            .collect();
-        losses.push(plain(format!(
-            "{:.1} %",
-            100.0 * crate::stats::mean(&cells)
-        )));
+        let cells: Vec<f64> =
+            returns.rows.iter().filter_map(|r| r.cells[column].as_ref()).map(|c| c.loss_rate).collect();
+        losses.push(plain(format!("{:.1} %", 100.0 * crate::stats::mean(&cells))));
     }
-    lines.push(Line {
-        kind: "loss",
-        cells: losses,
-    });
+    lines.push(Line { kind: "loss", cells: losses });
     Grid { header, lines }
 }
 
 /// The caption: what is counted, of which episodes.
 pub(super) fn caption(returns: &Returns) -> String {
-    format!(
-        "Return per test episode on {}. Reward: {}.",
-        returns.task,
-        returns.convention.trim_end_matches('.')
-    )
+    format!("Return per test episode on {}. Reward: {}.", returns.task, returns.convention.trim_end_matches('.'))
 }
 
 /// A Markdown document of the table with its caption and notes.
@@ -130,29 +82,14 @@ pub(super) fn document(returns: &Returns) -> String {
 
 /// The grid as a Markdown table; numbers to the right.
 pub(super) fn table(grid: &Grid) -> String {
-    let mut text = format!(
-        "| {} |\n",
-        grid.header
-            .iter()
-            .map(|h| escape(h))
-            .collect::<Vec<_>>()
-            .join(" | ")
-    );
-    let rule: Vec<&str> = (0..grid.header.len())
-        .map(|i| if i < 2 { "---" } else { "---:" })
-        .collect();
+    let mut text = format!("| {} |\n", grid.header.iter().map(|h| escape(h)).collect::<Vec<_>>().join(" | "));
+    let rule: Vec<&str> = (0..grid.header.len()).map(|i| if i < 2 { "---" } else { "---:" }).collect();
     text.push_str(&format!("| {} |\n", rule.join(" | ")));
     for line in &grid.lines {
         let cells: Vec<String> = line
             .cells
             .iter()
-            .map(|(cell, bold)| {
-                if *bold {
-                    format!("**{}**", escape(cell))
-                } else {
-                    escape(cell)
-                }
-            })
+            .map(|(cell, bold)| if *bold { format!("**{}**", escape(cell)) } else { escape(cell) })
             .collect();
         text.push_str(&format!("| {} |\n", cells.join(" | ")));
     }
@@ -244,10 +181,7 @@ mod tests {
     fn hostile_text_stays_text() {
         assert_eq!(escape("a|b<script>*x*\n"), "a\\|b&lt;script&gt;\\*x\\*\\n");
         assert_eq!(
-            csv(
-                &["a", "b"],
-                std::iter::once(vec!["x,\"y\"".to_owned(), "z".to_owned()])
-            ),
+            csv(&["a", "b"], std::iter::once(vec!["x,\"y\"".to_owned(), "z".to_owned()])),
             "a,b\n\"x,\"\"y\"\"\",z\n"
         );
     }

@@ -59,24 +59,12 @@ impl Estimate {
 pub(super) fn read(path: &Path) -> Result<MutualFile, ReportError> {
     let table = Columns::open_filled(path)?;
     let (estimator, x, y) = (table.text("estimator")?, table.text("x")?, table.text("y")?);
-    let (sender, receiver) = (
-        table.text_or_null("sender")?,
-        table.text_or_null("receiver")?,
-    );
-    let (delivered, value) = (
-        table.bits_or_null("delivered")?,
-        table.numbers_or_null("value")?,
-    );
+    let (sender, receiver) = (table.text_or_null("sender")?, table.text_or_null("receiver")?);
+    let (delivered, value) = (table.bits_or_null("delivered")?, table.numbers_or_null("value")?);
     let (unit, kind) = (table.text("unit")?, table.text("kind")?);
-    let (low, high) = (
-        table.numbers_or_null("interval_low")?,
-        table.numbers_or_null("interval_high")?,
-    );
-    let (p_value, n, warnings) = (
-        table.numbers_or_null("p_value")?,
-        table.whole("n")?,
-        table.text_or_null("warnings")?,
-    );
+    let (low, high) = (table.numbers_or_null("interval_low")?, table.numbers_or_null("interval_high")?);
+    let (p_value, n, warnings) =
+        (table.numbers_or_null("p_value")?, table.whole("n")?, table.text_or_null("warnings")?);
     let rows = (0..n.len()).map(|i| Estimate {
         estimator: estimator[i].clone(),
         x: x[i].clone(),
@@ -92,11 +80,7 @@ pub(super) fn read(path: &Path) -> Result<MutualFile, ReportError> {
         n: n[i],
         warnings: warnings[i].clone().unwrap_or_default(),
     });
-    Ok(MutualFile {
-        path: path.to_owned(),
-        sha256: sha256_file(path)?.0,
-        rows: rows.collect(),
-    })
+    Ok(MutualFile { path: path.to_owned(), sha256: sha256_file(path)?.0, rows: rows.collect() })
 }
 
 /// What a heat map of one file shows.
@@ -116,18 +100,11 @@ pub(super) struct Map {
 /// Chooses the estimator and lays out its links; `None` when no row names sender and receiver with a finite value.
 pub(super) fn map(file: &MutualFile) -> Option<Map> {
     let links = || {
-        file.rows.iter().filter_map(|r| {
-            Some((
-                r,
-                r.sender.as_ref()?,
-                r.receiver.as_ref()?,
-                r.value.filter(|v| v.is_finite())?,
-            ))
-        })
+        file.rows
+            .iter()
+            .filter_map(|r| Some((r, r.sender.as_ref()?, r.receiver.as_ref()?, r.value.filter(|v| v.is_finite())?)))
     };
-    let preferred = PREFERRED
-        .iter()
-        .find_map(|name| links().find(|(r, ..)| r.estimator == *name));
+    let preferred = PREFERRED.iter().find_map(|name| links().find(|(r, ..)| r.estimator == *name));
     let chosen = preferred.or_else(|| links().next())?.0;
     let mut agents: Vec<&String> = links().flat_map(|(_, s, r, _)| [s, r]).collect();
     agents.sort_by_key(|a| (a.len(), *a)); // agent_2 before agent_10
@@ -135,17 +112,14 @@ pub(super) fn map(file: &MutualFile) -> Option<Map> {
     let mut cells = Vec::new();
     let mut words = Vec::new();
     for class in ["delivered", "lost", "all messages"] {
-        let of_class: Vec<_> = links()
-            .filter(|(r, ..)| r.estimator == chosen.estimator && r.class() == class)
-            .collect();
+        let of_class: Vec<_> =
+            links().filter(|(r, ..)| r.estimator == chosen.estimator && r.class() == class).collect();
         if of_class.is_empty() {
             continue;
         }
         for sender in &agents {
             for receiver in &agents {
-                let found = of_class
-                    .iter()
-                    .find(|(_, s, r, _)| s == sender && r == receiver);
+                let found = of_class.iter().find(|(_, s, r, _)| s == sender && r == receiver);
                 cells.push(Cell {
                     panel: class.to_owned(),
                     sender: (*sender).clone(),
@@ -156,29 +130,15 @@ pub(super) fn map(file: &MutualFile) -> Option<Map> {
         }
         let values: Vec<f64> = of_class.iter().map(|f| f.3).collect();
         let mean = crate::stats::mean(&values);
-        words.push(format!(
-            "{class} {mean:.3} {} on average over {} links",
-            chosen.unit,
-            values.len()
-        ));
+        words.push(format!("{class} {mean:.3} {} on average over {} links", chosen.unit, values.len()));
     }
     let bound = match chosen.kind.as_str() {
         "estimate" => String::new(),
         kind => format!(" The value is a {kind}."),
     };
     let seen = format!("{}: {}.{bound}", chosen.estimator, words.join("; "));
-    let (estimator, unit, kind) = (
-        chosen.estimator.clone(),
-        chosen.unit.clone(),
-        chosen.kind.clone(),
-    );
-    Some(Map {
-        estimator,
-        unit,
-        kind,
-        cells,
-        seen,
-    })
+    let (estimator, unit, kind) = (chosen.estimator.clone(), chosen.unit.clone(), chosen.kind.clone());
+    Some(Map { estimator, unit, kind, cells, seen })
 }
 
 /// A value as a reader wants it: a deterministic copy has infinitely many nats.
@@ -195,13 +155,7 @@ pub(super) fn number(value: Option<f64>) -> String {
 mod tests {
     use super::*;
 
-    fn estimate(
-        estimator: &str,
-        sender: &str,
-        receiver: &str,
-        delivered: bool,
-        value: f64,
-    ) -> Estimate {
+    fn estimate(estimator: &str, sender: &str, receiver: &str, delivered: bool, value: f64) -> Estimate {
         Estimate {
             estimator: estimator.to_owned(),
             x: "message".to_owned(),
@@ -227,17 +181,10 @@ mod tests {
             estimate("jsd-plugin", "b", "a", true, 0.6),
             estimate("jsd-plugin", "a", "b", false, 0.0),
         ];
-        let map = map(&MutualFile {
-            path: PathBuf::new(),
-            sha256: String::new(),
-            rows,
-        })
-        .unwrap();
+        let map = map(&MutualFile { path: PathBuf::new(), sha256: String::new(), rows }).unwrap();
         assert_eq!(map.estimator, "jsd-plugin");
         assert_eq!(map.cells.len(), 8, "2 panels of 2 by 2");
-        assert!(
-            map.cells[0].value.is_nan() && map.cells[1].value == 0.4 && map.cells[5].value == 0.0
-        );
+        assert!(map.cells[0].value.is_nan() && map.cells[1].value == 0.4 && map.cells[5].value == 0.0);
         assert_eq!(
             map.seen,
             "jsd-plugin: delivered 0.500 nats on average over 2 links; lost 0.000 nats on average over 1 links. The \

@@ -81,15 +81,6 @@ pub(super) fn html(
         config: r.config_sha256.chars().take(12).collect(),
     };
     let origins = runs.iter().map(origin).collect();
-    let page = Page {
-        title,
-        lead,
-        sections,
-        origins,
-        tables: mi,
-        command,
-        version: env!("CARGO_PKG_VERSION"),
-    };
-    page.render()
-        .map_err(|e| ReportError::Internal(format!("page template: {e}")))
+    let page = Page { title, lead, sections, origins, tables: mi, command, version: env!("CARGO_PKG_VERSION") };
+    page.render().map_err(|e| ReportError::Internal(format!("page template: {e}")))
 }

@@ -35,47 +35,26 @@ impl Tables {
     /// [`ReportError::Internal`] when one is broken; a test holds that none is.
     pub fn load() -> Result<Self, ReportError> {
         let mut cells = BTreeMap::new();
-        for (table, text) in [
-            ("performance", PERFORMANCE),
-            ("scalability", SCALABILITY),
-            ("ablation", ABLATION),
-            ("priors", PRIORS),
-        ] {
+        for (table, text) in
+            [("performance", PERFORMANCE), ("scalability", SCALABILITY), ("ablation", ABLATION), ("priors", PRIORS)]
+        {
             let mut lines = text.lines();
             let header: Vec<&str> = lines.next().unwrap_or_default().split(',').collect();
             for line in lines {
                 let fields: Vec<&str> = line.split(',').collect();
-                let get = |name: &str| {
-                    header
-                        .iter()
-                        .position(|h| *h == name)
-                        .and_then(|i| fields.get(i))
-                        .copied()
-                };
+                let get = |name: &str| header.iter().position(|h| *h == name).and_then(|i| fields.get(i)).copied();
                 let number = |name: &str| get(name).and_then(|v| v.parse::<f64>().ok());
                 let row = match table {
-                    "ablation" => number("mi_min_coefficient")
-                        .zip(number("mi_max_coefficient"))
-                        .map(ablation_row),
+                    "ablation" => number("mi_min_coefficient").zip(number("mi_max_coefficient")).map(ablation_row),
                     "priors" => get("prior").map(str::to_owned),
                     _ => get("algorithm").map(str::to_owned),
                 };
-                let (Some(scenario), Some(agents), Some(channel), Some(row), Some(mean), Some(sd)) = (
-                    get("scenario"),
-                    number("agents"),
-                    get("test_env"),
-                    row,
-                    number("mean"),
-                    number("std"),
-                ) else {
-                    return Err(ReportError::Internal(format!(
-                        "published table {table}: broken line {line:?}"
-                    )));
+                let (Some(scenario), Some(agents), Some(channel), Some(row), Some(mean), Some(sd)) =
+                    (get("scenario"), number("agents"), get("test_env"), row, number("mean"), number("std"))
+                else {
+                    return Err(ReportError::Internal(format!("published table {table}: broken line {line:?}")));
                 };
-                cells.insert(
-                    (table, scenario, agents as i64, channel, row),
-                    Published { mean, sd, table },
-                );
+                cells.insert((table, scenario, agents as i64, channel, row), Published { mean, sd, table });
             }
         }
         Ok(Self { cells })
@@ -100,11 +79,7 @@ impl Tables {
         let agents = agents_in_paper(&run.task);
         let row_of = |table: &str, row: &str| {
             let found = self.cells.iter().find(|((t, scenario, n, c, r), _)| {
-                *t == table
-                    && *scenario == run.task.scenario
-                    && *n == agents
-                    && *c == channel
-                    && r == row
+                *t == table && *scenario == run.task.scenario && *n == agents && *c == channel && r == row
             });
             found.map(|(_, cell)| *cell)
         };
@@ -119,40 +94,23 @@ impl Tables {
 
 /// Which coefficients are on, as the row's name: `(CLUB β, JSD α)`.
 fn ablation_row((beta, alpha): (f64, f64)) -> String {
-    format!(
-        "ablation min {} max {}",
-        if beta == 0.0 { "off" } else { "on" },
-        if alpha == 0.0 { "off" } else { "on" }
-    )
+    format!("ablation min {} max {}", if beta == 0.0 { "off" } else { "on" }, if alpha == 0.0 { "off" } else { "on" })
 }
 
 /// The paper counts the two good agents of `simple_adversary`; this program counts all three.
 fn agents_in_paper(task: &Task) -> i64 {
-    if task.scenario == "simple_adversary" && task.agents == 3 {
-        2
-    } else {
-        task.agents
-    }
+    if task.scenario == "simple_adversary" && task.agents == 3 { 2 } else { task.agents }
 }
 
 /// The coefficients (β, α) of a run, where its configuration names them.
 pub(super) fn coefficients(run: &Run) -> (Option<f64>, Option<f64>) {
-    let get = |key: &str| {
-        run.settings
-            .get(&format!("maddpg.{key}"))
-            .and_then(|v| v.parse().ok())
-    };
+    let get = |key: &str| run.settings.get(&format!("maddpg.{key}")).and_then(|v| v.parse().ok());
     (get("beta"), get("alpha"))
 }
 
 /// The row of the paper that a run reproduces: same preset, same prior, same terms switched on.
 fn row(run: &Run, channel: &str) -> Option<String> {
-    let number = |key: &str| {
-        run.prior
-            .params
-            .get(key)
-            .and_then(serde_json::Value::as_f64)
-    };
+    let number = |key: &str| run.prior.params.get(key).and_then(serde_json::Value::as_f64);
     let dropout = |p: f64| run.prior.name == "dropout" && number("p") == Some(p);
     let preset = match run.algorithm.as_str() {
         "maddpg" => run.prior.name == "none",
@@ -163,9 +121,7 @@ fn row(run: &Run, channel: &str) -> Option<String> {
         _ => false,
     };
     let off = match coefficients(run) {
-        (Some(beta), Some(alpha)) if beta == 0.0 || alpha == 0.0 => {
-            Some(ablation_row((beta, alpha)))
-        }
+        (Some(beta), Some(alpha)) if beta == 0.0 || alpha == 0.0 => Some(ablation_row((beta, alpha))),
         _ => None,
     };
     match (preset, off) {
@@ -189,9 +145,7 @@ fn row(run: &Run, channel: &str) -> Option<String> {
 /// `shown` lists `(algorithm, channel, cell)` for every published cell of the table.
 pub(super) fn misprints(task: &Task, shown: &[(String, String, Published)]) -> Vec<String> {
     let has = |algorithm: &str, distance: bool| {
-        shown
-            .iter()
-            .any(|(a, c, _)| a == algorithm && (!distance || c.starts_with("dbc-")))
+        shown.iter().any(|(a, c, _)| a == algorithm && (!distance || c.starts_with("dbc-")))
     };
     let in_table = |table: &str| shown.iter().any(|(_, _, cell)| cell.table == table);
     let mut notes = Vec::new();
@@ -202,8 +156,7 @@ pub(super) fn misprints(task: &Task, shown: &[(String, String, Published)]) -> V
     };
     let scenario = task.scenario.as_str();
     note(
-        scenario == "simple_spread"
-            && (has("dropout-maddpg-0.2", true) || has("dropout-maddpg-0.5", true)),
+        scenario == "simple_spread" && (has("dropout-maddpg-0.2", true) || has("dropout-maddpg-0.5", true)),
         "Misprint: for simple_spread under the distance channels, the published means of dropout-maddpg-0.2 and \
          dropout-maddpg-0.5 look swapped: the ablation table gives -145.6, -143.4, -144.5 for dropout 0.2 without MI \
          terms, which the performance table prints for 0.5. The deviations are not swapped. Shown as printed.",
@@ -262,11 +215,7 @@ pub(super) mod tests {
             seed: 1,
             steps: 1000,
             algorithm: algorithm.to_owned(),
-            task: Task {
-                scenario: scenario.to_owned(),
-                profile: "paper".to_owned(),
-                agents,
-            },
+            task: Task { scenario: scenario.to_owned(), profile: "paper".to_owned(), agents },
             scenario: Spec::new(scenario),
             prior,
             config_sha256: String::new(),
@@ -287,50 +236,21 @@ pub(super) mod tests {
         let dropout = |p: f64| Spec::new("dropout").with("p", p);
         let cell = |r: &Run, channel| tables.of(r, channel).map(|c| (c.mean, c.sd, c.table));
         let cc = run("simple_tag", 3, "cc-maddpg", dropout(0.2));
-        assert_eq!(
-            cell(&cc, "unrestricted"),
-            Some((134.7, 89.9, "performance"))
-        );
+        assert_eq!(cell(&cc, "unrestricted"), Some((134.7, 89.9, "performance")));
         assert_eq!(cell(&cc, "none"), None);
         let six = run("simple_tag", 6, "fc-maddpg", Spec::new("perfect"));
-        assert_eq!(
-            cell(&six, "unrestricted"),
-            Some((138.5, 88.0, "scalability"))
-        );
+        assert_eq!(cell(&six, "unrestricted"), Some((138.5, 88.0, "scalability")));
         let adversary = run("simple_adversary", 3, "maddpg", Spec::new("none"));
-        assert_eq!(
-            cell(&adversary, "dbc-heavy"),
-            Some((-7.8, 5.5, "performance"))
-        );
-        let matched = run(
-            "simple_spread",
-            3,
-            "cc-maddpg",
-            Spec::new("distance").with("threshold", 3),
-        );
+        assert_eq!(cell(&adversary, "dbc-heavy"), Some((-7.8, 5.5, "performance")));
+        let matched = run("simple_spread", 3, "cc-maddpg", Spec::new("distance").with("threshold", 3));
         assert_eq!(cell(&matched, "dbc-medium"), Some((-98.0, 30.5, "priors")));
-        assert_eq!(
-            cell(&matched, "dbc-light"),
-            None,
-            "matched to another channel"
-        );
+        assert_eq!(cell(&matched, "dbc-light"), None, "matched to another channel");
         let other_prior = run("simple_tag", 3, "cc-maddpg", dropout(0.5));
-        assert_eq!(
-            cell(&other_prior, "unrestricted"),
-            None,
-            "the paper has no such row"
-        );
+        assert_eq!(cell(&other_prior, "unrestricted"), None, "the paper has no such row");
         let mut ablated = cc.clone();
-        ablated
-            .settings
-            .insert("dumie.alpha".to_owned(), "0.0".to_owned());
-        ablated
-            .settings
-            .insert("dumie.beta".to_owned(), "0.001".to_owned());
-        assert_eq!(
-            cell(&ablated, "unrestricted"),
-            Some((120.5, 82.1, "ablation"))
-        );
+        ablated.settings.insert("dumie.alpha".to_owned(), "0.0".to_owned());
+        ablated.settings.insert("dumie.beta".to_owned(), "0.001".to_owned());
+        assert_eq!(cell(&ablated, "unrestricted"), Some((120.5, 82.1, "ablation")));
         let mut other_profile = cc;
         other_profile.task.profile = "mpe2".to_owned();
         assert_eq!(cell(&other_profile, "unrestricted"), None);
@@ -338,22 +258,12 @@ pub(super) mod tests {
 
     #[test]
     fn a_misprint_is_noted_only_where_it_is_shown() {
-        let cell = Published {
-            mean: 0.0,
-            sd: 1.0,
-            table: "performance",
-        };
+        let cell = Published { mean: 0.0, sd: 1.0, table: "performance" };
         let notes = |scenario: &str, algorithm: &str, channel: &str| {
-            let task = Task {
-                scenario: scenario.to_owned(),
-                profile: "paper".to_owned(),
-                agents: 3,
-            };
+            let task = Task { scenario: scenario.to_owned(), profile: "paper".to_owned(), agents: 3 };
             misprints(&task, &[(algorithm.to_owned(), channel.to_owned(), cell)])
         };
-        assert!(
-            notes("simple_spread", "dropout-maddpg-0.5", "dbc-light")[0].contains("look swapped")
-        );
+        assert!(notes("simple_spread", "dropout-maddpg-0.5", "dbc-light")[0].contains("look swapped"));
         assert!(notes("simple_spread", "dropout-maddpg-0.5", "mbc-light").is_empty());
         assert!(notes("simple_tag", "dropout-maddpg-0.5", "dbc-light").is_empty());
     }

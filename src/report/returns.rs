@@ -9,16 +9,8 @@ use crate::report::{Published, ReportError, Run, Tables, Task};
 use crate::stats::{Interval, mean, sd, t_interval};
 
 /// Test channels in the order of columns; others follow by name.
-pub const CHANNELS: [&str; 8] = [
-    "unrestricted",
-    "mbc-light",
-    "mbc-medium",
-    "mbc-heavy",
-    "dbc-light",
-    "dbc-medium",
-    "dbc-heavy",
-    "none",
-];
+pub const CHANNELS: [&str; 8] =
+    ["unrestricted", "mbc-light", "mbc-medium", "mbc-heavy", "dbc-light", "dbc-medium", "dbc-heavy", "none"];
 
 /// Algorithms in the order of rows; others follow by name.
 const ALGORITHMS: [&str; 9] = [
@@ -103,10 +95,7 @@ pub struct Returns {
 
 /// One line of the tidy CSV.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-#[expect(
-    missing_docs,
-    reason = "the fields are the columns, named like those of the table"
-)]
+#[expect(missing_docs, reason = "the fields are the columns, named like those of the table")]
 pub struct Tidy {
     pub scenario: String,
     pub profile: String,
@@ -132,16 +121,10 @@ pub struct Tidy {
 /// # Errors
 /// [`ReportError::Duplicate`]: two runs of one series with one seed.
 pub(super) fn series<'a>(runs: &[&'a Run]) -> Result<Vec<(String, Vec<&'a Run>)>, ReportError> {
-    let mut groups: BTreeMap<(usize, &str, &BTreeMap<String, String>), Vec<&'a Run>> =
-        BTreeMap::new();
+    let mut groups: BTreeMap<(usize, &str, &BTreeMap<String, String>), Vec<&'a Run>> = BTreeMap::new();
     for run in runs {
-        let rank = ALGORITHMS
-            .iter()
-            .position(|a| *a == run.algorithm)
-            .unwrap_or(ALGORITHMS.len());
-        let group = groups
-            .entry((rank, &run.algorithm, &run.settings))
-            .or_default();
+        let rank = ALGORITHMS.iter().position(|a| *a == run.algorithm).unwrap_or(ALGORITHMS.len());
+        let group = groups.entry((rank, &run.algorithm, &run.settings)).or_default();
         if let Some(twin) = group.iter().find(|other| other.seed == run.seed) {
             return Err(ReportError::Duplicate {
                 series: run.algorithm.clone(),
@@ -152,13 +135,7 @@ pub(super) fn series<'a>(runs: &[&'a Run]) -> Result<Vec<(String, Vec<&'a Run>)>
         }
         group.push(run);
     }
-    let same_name = |name: &str| {
-        groups
-            .keys()
-            .filter(|(_, n, _)| *n == name)
-            .map(|(_, _, s)| *s)
-            .collect::<Vec<_>>()
-    };
+    let same_name = |name: &str| groups.keys().filter(|(_, n, _)| *n == name).map(|(_, _, s)| *s).collect::<Vec<_>>();
     let named = groups.iter().map(|((_, name, settings), group)| {
         let mut group = group.clone();
         group.sort_by_key(|r| r.seed);
@@ -176,15 +153,8 @@ fn label(
 ) -> String {
     let mut differing: BTreeMap<&str, &str> = BTreeMap::new();
     for other in namesakes {
-        for key in settings
-            .keys()
-            .chain(other.keys())
-            .filter(|k| settings.get(*k) != other.get(*k))
-        {
-            differing.insert(
-                key,
-                settings.get(key).map_or("default", |v| v.trim_matches('"')),
-            );
+        for key in settings.keys().chain(other.keys()).filter(|k| settings.get(*k) != other.get(*k)) {
+            differing.insert(key, settings.get(key).map_or("default", |v| v.trim_matches('"')));
         }
     }
     if name == "cc-maddpg" {
@@ -198,10 +168,8 @@ fn label(
     if differing.is_empty() {
         return name.to_owned();
     }
-    let words: Vec<String> = differing
-        .iter()
-        .map(|(key, value)| format!("{}={value}", key.strip_prefix("dumie.").unwrap_or(key)))
-        .collect();
+    let words: Vec<String> =
+        differing.iter().map(|(key, value)| format!("{}={value}", key.strip_prefix("dumie.").unwrap_or(key))).collect();
     format!("{name} ({})", words.join(", "))
 }
 
@@ -216,48 +184,28 @@ pub(super) fn table(
     reference: Option<&Reference>,
     tables: &Tables,
 ) -> Result<Option<Returns>, ReportError> {
-    let evaluated: Vec<&Run> = runs
-        .iter()
-        .copied()
-        .filter(|r| !r.episodes.is_empty())
-        .collect();
+    let evaluated: Vec<&Run> = runs.iter().copied().filter(|r| !r.episodes.is_empty()).collect();
     if evaluated.is_empty() {
         return Ok(None);
     }
     let mut channels: Vec<String> = Vec::new();
-    for channel in evaluated
-        .iter()
-        .flat_map(|r| &r.episodes)
-        .map(|e| &e.channel)
-    {
+    for channel in evaluated.iter().flat_map(|r| &r.episodes).map(|e| &e.channel) {
         if !channels.contains(channel) {
             channels.push(channel.clone());
         }
     }
-    let rank = |c: &String| {
-        CHANNELS
-            .iter()
-            .position(|k| k == c)
-            .unwrap_or(CHANNELS.len())
-    };
+    let rank = |c: &String| CHANNELS.iter().position(|k| k == c).unwrap_or(CHANNELS.len());
     channels.sort_by(|a, b| rank(a).cmp(&rank(b)).then(a.cmp(b)));
     let mut rows = Vec::new();
     let mut shown = Vec::new();
     for (name, group) in series(&evaluated)? {
-        let cells = channels
-            .iter()
-            .map(|channel| cell(&group, channel, tables))
-            .collect::<Vec<_>>();
+        let cells = channels.iter().map(|channel| cell(&group, channel, tables)).collect::<Vec<_>>();
         for (channel, cell) in channels.iter().zip(&cells) {
             if let Some(published) = cell.as_ref().and_then(|c| c.published) {
                 shown.push((group[0].algorithm.clone(), channel.clone(), published));
             }
         }
-        rows.push(Row {
-            series: name,
-            seeds: group.iter().map(|r| r.seed).collect(),
-            cells,
-        });
+        rows.push(Row { series: name, seeds: group.iter().map(|r| r.seed).collect(), cells });
     }
     mark_best(&mut rows, channels.len());
     let mut references = Vec::new();
@@ -284,36 +232,16 @@ pub(super) fn table(
         );
     }
     notes.extend(misprints(task, &shown));
-    Ok(Some(Returns {
-        task: task.clone(),
-        convention: convention.to_owned(),
-        channels,
-        rows,
-        references,
-        notes,
-    }))
+    Ok(Some(Returns { task: task.clone(), convention: convention.to_owned(), channels, rows, references, notes }))
 }
 
 fn cell(group: &[&Run], channel: &str, tables: &Tables) -> Option<Cell> {
-    let of = |run: &Run| {
-        run.episodes
-            .iter()
-            .filter(|e| e.channel == channel)
-            .cloned()
-            .collect::<Vec<_>>()
-    };
-    let by_seed: Vec<_> = group
-        .iter()
-        .map(|run| of(run))
-        .filter(|e| !e.is_empty())
-        .collect();
+    let of = |run: &Run| run.episodes.iter().filter(|e| e.channel == channel).cloned().collect::<Vec<_>>();
+    let by_seed: Vec<_> = group.iter().map(|run| of(run)).filter(|e| !e.is_empty()).collect();
     if by_seed.is_empty() {
         return None;
     }
-    let means: Vec<f64> = by_seed
-        .iter()
-        .map(|es| mean(&es.iter().map(|e| e.value).collect::<Vec<_>>()))
-        .collect();
+    let means: Vec<f64> = by_seed.iter().map(|es| mean(&es.iter().map(|e| e.value).collect::<Vec<_>>())).collect();
     let all: Vec<f64> = by_seed.iter().flatten().map(|e| e.value).collect();
     let losses: Vec<f64> = by_seed.iter().flatten().map(|e| e.loss_rate).collect();
     let enough = means.len() >= SEEDS_FOR_INTERVAL;
@@ -321,11 +249,7 @@ fn cell(group: &[&Run], channel: &str, tables: &Tables) -> Option<Cell> {
         episodes: all.len(),
         mean: mean(&means),
         sd: if all.len() < 2 { 0.0 } else { sd(&all) },
-        interval: if enough {
-            t_interval(&means, 0.95)
-        } else {
-            None
-        },
+        interval: if enough { t_interval(&means, 0.95) } else { None },
         loss_rate: mean(&losses),
         published: tables.of(group[0], channel),
         best: false,
@@ -336,18 +260,11 @@ fn cell(group: &[&Run], channel: &str, tables: &Tables) -> Option<Cell> {
 /// have intervals over seeds and there are at least two.
 fn mark_best(rows: &mut [Row], columns: usize) {
     for column in 0..columns {
-        let cells: Vec<&Cell> = rows
-            .iter()
-            .filter_map(|r| r.cells[column].as_ref())
-            .collect();
+        let cells: Vec<&Cell> = rows.iter().filter_map(|r| r.cells[column].as_ref()).collect();
         if cells.len() < 2 || cells.iter().any(|c| c.interval.is_none()) {
             continue;
         }
-        let best = cells
-            .iter()
-            .copied()
-            .max_by(|a, b| a.mean.total_cmp(&b.mean))
-            .and_then(|c| c.interval);
+        let best = cells.iter().copied().max_by(|a, b| a.mean.total_cmp(&b.mean)).and_then(|c| c.interval);
         let Some(best) = best else { continue };
         for cell in rows.iter_mut().filter_map(|r| r.cells[column].as_mut()) {
             cell.best = cell.interval.is_some_and(|i| i.high >= best.low);
@@ -356,10 +273,7 @@ fn mark_best(rows: &mut [Row], columns: usize) {
 }
 
 fn spread_notes(rows: &[Row]) -> Vec<String> {
-    let few = rows
-        .iter()
-        .filter(|r| r.seeds.len() < SEEDS_FOR_INTERVAL)
-        .count();
+    let few = rows.iter().filter(|r| r.seeds.len() < SEEDS_FOR_INTERVAL).count();
     let mut notes = Vec::new();
     if few < rows.len() {
         notes.push("± with three or more seeds: half of the 95 % Student interval for the mean over seeds.".to_owned());
@@ -371,10 +285,13 @@ fn spread_notes(rows: &[Row]) -> Vec<String> {
                 .to_owned(),
         );
         notes.push(
-            "No value is set in bold: a best algorithm is named only when every row has at least three seeds.".to_owned(),
+            "No value is set in bold: a best algorithm is named only when every row has at least three seeds."
+                .to_owned(),
         );
     } else if rows.len() > 1 {
-        notes.push("Bold: the highest mean of a column, and every mean whose interval reaches into its interval.".to_owned());
+        notes.push(
+            "Bold: the highest mean of a column, and every mean whose interval reaches into its interval.".to_owned(),
+        );
     }
     notes
 }

@@ -52,24 +52,18 @@ impl Layout {
 
     /// Indices of the communicators, in order: the rows and columns of the link matrix.
     pub fn communicators(&self) -> Vec<usize> {
-        (0..self.agents.len())
-            .filter(|&a| self.agents[a].communicator)
-            .collect()
+        (0..self.agents.len()).filter(|&a| self.agents[a].communicator).collect()
     }
 
     /// Indices of the learners, in order.
     pub fn learners(&self) -> Vec<usize> {
-        (0..self.agents.len())
-            .filter(|&a| self.agents[a].learner)
-            .collect()
+        (0..self.agents.len()).filter(|&a| self.agents[a].learner).collect()
     }
 
     /// Ordered pairs (sender, receiver) of distinct communicators, as agent indices, sender-major.
     pub fn links(&self) -> Vec<(usize, usize)> {
         let c = self.communicators();
-        c.iter()
-            .flat_map(|&s| c.iter().filter(move |&&r| r != s).map(move |&r| (s, r)))
-            .collect()
+        c.iter().flat_map(|&s| c.iter().filter(move |&&r| r != s).map(move |&r| (s, r))).collect()
     }
 
     /// Checks names and widths.
@@ -79,37 +73,21 @@ impl Layout {
     pub fn check(&self) -> Result<(), SchemaError> {
         let fail = |m: String| Err(SchemaError::Manifest(m));
         if self.agents.is_empty() || self.agents.len() > Self::MAX_AGENTS {
-            return fail(format!(
-                "expected 1 to {} agents, found {}",
-                Self::MAX_AGENTS,
-                self.agents.len()
-            ));
+            return fail(format!("expected 1 to {} agents, found {}", Self::MAX_AGENTS, self.agents.len()));
         }
         if self.state_fields.len() > Self::MAX_WIDTH {
-            return fail(format!(
-                "{} state fields are over the limit of {}",
-                self.state_fields.len(),
-                Self::MAX_WIDTH
-            ));
+            return fail(format!("{} state fields are over the limit of {}", self.state_fields.len(), Self::MAX_WIDTH));
         }
         for (i, agent) in self.agents.iter().enumerate() {
             let name = &agent.name;
-            if name.is_empty()
-                || name.len() > 64
-                || !name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_')
-            {
-                return fail(format!(
-                    "agent name {name:?}: use 1 to 64 letters, digits and underscores"
-                ));
+            if name.is_empty() || name.len() > 64 || !name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_') {
+                return fail(format!("agent name {name:?}: use 1 to 64 letters, digits and underscores"));
             }
             if self.agents[..i].iter().any(|a| a.name == *name) {
                 return fail(format!("agent name {name:?} occurs twice"));
             }
             if agent.observation.max(agent.message).max(agent.action) > Self::MAX_WIDTH {
-                return fail(format!(
-                    "agent {name}: a column is wider than {}",
-                    Self::MAX_WIDTH
-                ));
+                return fail(format!("agent {name}: a column is wider than {}", Self::MAX_WIDTH));
             }
         }
         Ok(())

@@ -16,10 +16,7 @@ pub struct Matrix {
 impl Matrix {
     /// An empty matrix of `width` columns with room for `rows`.
     pub fn with_capacity(rows: usize, width: usize) -> Self {
-        Self {
-            data: Vec::with_capacity(rows * width),
-            width,
-        }
+        Self { data: Vec::with_capacity(rows * width), width }
     }
 
     /// Rows.
@@ -63,11 +60,7 @@ impl Episode {
     pub fn with_capacity(layout: &Layout, index: u64, steps: usize) -> Self {
         let n = layout.communicators().len();
         let matrices = |rows: usize, width: fn(&super::AgentSpec) -> usize| {
-            layout
-                .agents
-                .iter()
-                .map(|a| Matrix::with_capacity(rows, width(a)))
-                .collect()
+            layout.agents.iter().map(|a| Matrix::with_capacity(rows, width(a))).collect()
         };
         Self {
             index,
@@ -104,42 +97,18 @@ impl Episode {
     /// [`SchemaError::Length`] or [`SchemaError::Value`] that names the column.
     pub fn check(&self, layout: &Layout) -> Result<(), SchemaError> {
         let length = |column: String, expected: usize, found: usize| {
-            if expected == found {
-                Ok(())
-            } else {
-                Err(SchemaError::Length {
-                    column,
-                    expected,
-                    found,
-                })
-            }
+            if expected == found { Ok(()) } else { Err(SchemaError::Length { column, expected, found }) }
         };
         let (t, agents) = (self.steps, layout.agents.len());
-        length(
-            "state".to_owned(),
-            (t + 1) * layout.state_fields.len(),
-            self.state.len(),
-        )?;
+        length("state".to_owned(), (t + 1) * layout.state_fields.len(), self.state.len())?;
         length("agents".to_owned(), agents, self.observations.len())?;
         length("agents".to_owned(), agents, self.messages.len())?;
         length("agents".to_owned(), agents, self.actions.len())?;
         length("agents".to_owned(), agents, self.rewards.len())?;
         for (i, agent) in layout.agents.iter().enumerate() {
-            length(
-                format!("observation.{}", agent.name),
-                (t + 1) * agent.observation,
-                self.observations[i].data.len(),
-            )?;
-            length(
-                format!("message.{}", agent.name),
-                (t + 1) * agent.message,
-                self.messages[i].data.len(),
-            )?;
-            length(
-                format!("action.{}", agent.name),
-                t * agent.action,
-                self.actions[i].data.len(),
-            )?;
+            length(format!("observation.{}", agent.name), (t + 1) * agent.observation, self.observations[i].data.len())?;
+            length(format!("message.{}", agent.name), (t + 1) * agent.message, self.messages[i].data.len())?;
+            length(format!("action.{}", agent.name), t * agent.action, self.actions[i].data.len())?;
             length(format!("reward.{}", agent.name), t, self.rewards[i].len())?;
         }
         length("reward".to_owned(), t, self.reward.len())?;
@@ -147,12 +116,8 @@ impl Episode {
         length("link".to_owned(), (t + 1) * n * n, self.link.len())?;
         for row in 0..=t {
             if let Some(c) = (0..n).find(|&c| !self.delivered(n, row, c, c)) {
-                let message =
-                    format!("step {row}: the diagonal must be true, communicator {c} has false");
-                return Err(SchemaError::Value {
-                    column: "link".to_owned(),
-                    message,
-                });
+                let message = format!("step {row}: the diagonal must be true, communicator {c} has false");
+                return Err(SchemaError::Value { column: "link".to_owned(), message });
             }
         }
         Ok(())

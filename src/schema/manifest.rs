@@ -7,8 +7,7 @@ use sha2::{Digest as _, Sha256};
 use super::{AgentSpec, Layout, SCHEMA_VERSION, SchemaError};
 
 /// What stands in `self_sha256` while the digest is taken.
-pub const SELF_SHA256_PLACEHOLDER: &str =
-    "0000000000000000000000000000000000000000000000000000000000000000";
+pub const SELF_SHA256_PLACEHOLDER: &str = "0000000000000000000000000000000000000000000000000000000000000000";
 
 /// One file of a store.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -84,10 +83,7 @@ impl Manifest {
 
     /// The shape of its episodes.
     pub fn layout(&self) -> Layout {
-        Layout {
-            agents: self.agents.clone(),
-            state_fields: self.state_fields.clone(),
-        }
+        Layout { agents: self.agents.clone(), state_fields: self.state_fields.clone() }
     }
 
     /// The JSON text with `self_sha256` filled in.
@@ -95,13 +91,8 @@ impl Manifest {
     /// # Errors
     /// [`SchemaError::Manifest`] when it cannot be written as JSON.
     pub fn sealed_json(&self) -> Result<String, SchemaError> {
-        let zeroed = Self {
-            self_sha256: SELF_SHA256_PLACEHOLDER.to_owned(),
-            ..self.clone()
-        };
-        let text = serde_json::to_string_pretty(&zeroed)
-            .map_err(|e| SchemaError::Manifest(e.to_string()))?
-            + "\n";
+        let zeroed = Self { self_sha256: SELF_SHA256_PLACEHOLDER.to_owned(), ..self.clone() };
+        let text = serde_json::to_string_pretty(&zeroed).map_err(|e| SchemaError::Manifest(e.to_string()))? + "\n";
         let digest = hex(&Sha256::digest(text.as_bytes()));
         Ok(text.replacen(
             &format!("\"self_sha256\": \"{SELF_SHA256_PLACEHOLDER}\""),
@@ -122,39 +113,25 @@ impl Manifest {
         let fail = |m: String| SchemaError::Manifest(m);
         let version: VersionOnly = serde_json::from_str(text).map_err(|e| fail(e.to_string()))?;
         if version.schema_version > SCHEMA_VERSION {
-            return Err(SchemaError::Version {
-                found: version.schema_version,
-            });
+            return Err(SchemaError::Version { found: version.schema_version });
         }
         let manifest: Self = serde_json::from_str(text).map_err(|e| fail(e.to_string()))?;
         let zeroed = text.replacen(&manifest.self_sha256, SELF_SHA256_PLACEHOLDER, 1);
         let digest = hex(&Sha256::digest(zeroed.as_bytes()));
         if manifest.self_sha256.len() != 64 || manifest.self_sha256 != digest {
-            return Err(fail(
-                "self_sha256 does not match its text: the manifest was changed or damaged"
-                    .to_owned(),
-            ));
+            return Err(fail("self_sha256 does not match its text: the manifest was changed or damaged".to_owned()));
         }
         if manifest.kind != "rollouts" {
-            return Err(fail(format!(
-                "kind: expected \"rollouts\", found {:?}",
-                manifest.kind
-            )));
+            return Err(fail(format!("kind: expected \"rollouts\", found {:?}", manifest.kind)));
         }
         manifest.layout().check()?;
         for part in &manifest.parts {
             let bare = !part.file.is_empty()
                 && part.file.len() <= 255
                 && !part.file.starts_with('.')
-                && part
-                    .file
-                    .chars()
-                    .all(|c| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.'));
+                && part.file.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.'));
             if !bare {
-                return Err(fail(format!(
-                    "part name {:?} is not a plain file name inside the store",
-                    part.file
-                )));
+                return Err(fail(format!("part name {:?} is not a plain file name inside the store", part.file)));
             }
         }
         Ok(manifest)
@@ -163,14 +140,12 @@ impl Manifest {
 
 /// Lower-case hex of a digest.
 pub fn hex(bytes: &[u8]) -> String {
-    bytes
-        .iter()
-        .fold(String::with_capacity(bytes.len() * 2), |mut s, b| {
-            for nibble in [b >> 4, b & 15] {
-                s.push(char::from_digit(u32::from(nibble), 16).unwrap_or('0'));
-            }
-            s
-        })
+    bytes.iter().fold(String::with_capacity(bytes.len() * 2), |mut s, b| {
+        for nibble in [b >> 4, b & 15] {
+            s.push(char::from_digit(u32::from(nibble), 16).unwrap_or('0'));
+        }
+        s
+    })
 }
 
 #[cfg(test)]
@@ -189,10 +164,7 @@ mod tests {
             message: 4,
             action: 2,
         };
-        let layout = Layout {
-            agents: vec![agent],
-            state_fields: vec!["agent_0.x".to_owned()],
-        };
+        let layout = Layout { agents: vec![agent], state_fields: vec!["agent_0.x".to_owned()] };
         Manifest::new(1, Value::Null, Value::Null, Value::Null, &layout)
     }
 
@@ -200,13 +172,7 @@ mod tests {
     fn a_sealed_manifest_reads_back() {
         let text = manifest().sealed_json().unwrap();
         let read = Manifest::parse(&text).unwrap();
-        assert_eq!(
-            Manifest {
-                self_sha256: String::new(),
-                ..read
-            },
-            manifest()
-        );
+        assert_eq!(Manifest { self_sha256: String::new(), ..read }, manifest());
     }
 
     #[test]
@@ -216,37 +182,21 @@ mod tests {
             let mut changed = text.clone();
             changed[bit / 8] ^= 1 << (bit % 8);
             if let Ok(changed) = String::from_utf8(changed) {
-                assert!(
-                    Manifest::parse(&changed).is_err(),
-                    "bit {bit} went unnoticed"
-                );
+                assert!(Manifest::parse(&changed).is_err(), "bit {bit} went unnoticed");
             }
         }
     }
 
     #[test]
     fn a_newer_version_names_the_remedy() {
-        let text = manifest()
-            .sealed_json()
-            .unwrap()
-            .replace("\"schema_version\": 1", "\"schema_version\": 2");
+        let text = manifest().sealed_json().unwrap().replace("\"schema_version\": 1", "\"schema_version\": 2");
         let error = Manifest::parse(&text).unwrap_err().to_string();
-        assert!(
-            error.contains("schema version 2 is newer") && error.contains("install"),
-            "{error}"
-        );
+        assert!(error.contains("schema version 2 is newer") && error.contains("install"), "{error}");
     }
 
     #[test]
     fn a_part_outside_the_directory_is_refused() {
-        for file in [
-            "../x.parquet",
-            "/etc/passwd",
-            "a/b.parquet",
-            "",
-            ".hidden",
-            "a\u{1b}[2J",
-        ] {
+        for file in ["../x.parquet", "/etc/passwd", "a/b.parquet", "", ".hidden", "a\u{1b}[2J"] {
             let mut m = manifest();
             let part = Part {
                 file: file.to_owned(),
@@ -256,10 +206,7 @@ mod tests {
                 content: String::new(),
             };
             m.parts.push(part);
-            assert!(
-                Manifest::parse(&m.sealed_json().unwrap()).is_err(),
-                "{file:?} was accepted"
-            );
+            assert!(Manifest::parse(&m.sealed_json().unwrap()).is_err(), "{file:?} was accepted");
         }
     }
 }

@@ -36,17 +36,13 @@ pub fn stratified_interval(
         .map(|_| {
             pooled.clear();
             for stratum in strata {
-                pooled
-                    .extend((0..stratum.len()).map(|_| stratum[below(&mut stream, stratum.len())]));
+                pooled.extend((0..stratum.len()).map(|_| stratum[below(&mut stream, stratum.len())]));
             }
             statistic(&pooled)
         })
         .collect();
     let tail = (1.0 - level) / 2.0;
-    Some(Interval {
-        low: quantile(&replicates, tail),
-        high: quantile(&replicates, 1.0 - tail),
-    })
+    Some(Interval { low: quantile(&replicates, tail), high: quantile(&replicates, 1.0 - tail) })
 }
 
 #[cfg(test)]
@@ -61,14 +57,8 @@ mod tests {
         let values: Vec<f64> = (0..400).map(|_| normal(&mut stream)).collect();
         let interval = bootstrap_interval(&values, mean, 0.95, 2000, &Seeds::new(1)).unwrap();
         let half = 1.96 * standard_error(&values);
-        assert!(
-            (interval.high - mean(&values) - half).abs() < 0.012,
-            "{interval:?}"
-        );
-        assert!(
-            (mean(&values) - interval.low - half).abs() < 0.012,
-            "{interval:?}"
-        );
+        assert!((interval.high - mean(&values) - half).abs() < 0.012, "{interval:?}");
+        assert!((mean(&values) - interval.low - half).abs() < 0.012, "{interval:?}");
     }
 
     #[test]
@@ -82,24 +72,8 @@ mod tests {
     #[test]
     fn strata_are_never_mixed() {
         // each task is constant, so within-task resampling cannot move the pooled mean
-        let interval = stratified_interval(
-            &[&[0.0, 0.0], &[10.0, 10.0]],
-            mean,
-            0.95,
-            100,
-            &Seeds::new(1),
-        )
-        .unwrap();
-        assert_eq!(
-            interval,
-            Interval {
-                low: 5.0,
-                high: 5.0
-            }
-        );
-        assert_eq!(
-            stratified_interval(&[&[], &[1.0, 2.0]], mean, 0.95, 100, &Seeds::new(1)),
-            None
-        );
+        let interval = stratified_interval(&[&[0.0, 0.0], &[10.0, 10.0]], mean, 0.95, 100, &Seeds::new(1)).unwrap();
+        assert_eq!(interval, Interval { low: 5.0, high: 5.0 });
+        assert_eq!(stratified_interval(&[&[], &[1.0, 2.0]], mean, 0.95, 100, &Seeds::new(1)), None);
     }
 }

@@ -65,30 +65,18 @@ pub fn iqm(values: &[f64]) -> f64 {
 /// Student's interval for the mean at confidence `level`, n − 1 degrees of freedom; `None` of fewer than two values.
 pub fn t_interval(values: &[f64], level: f64) -> Option<Interval> {
     let freedom = values.len().checked_sub(1).filter(|&f| f > 0)?;
-    let t = StudentsT::new(0.0, 1.0, freedom as f64)
-        .ok()?
-        .inverse_cdf(0.5 + level / 2.0);
+    let t = StudentsT::new(0.0, 1.0, freedom as f64).ok()?.inverse_cdf(0.5 + level / 2.0);
     let (center, half) = (mean(values), t * standard_error(values));
-    Some(Interval {
-        low: center - half,
-        high: center + half,
-    })
+    Some(Interval { low: center - half, high: center + half })
 }
 
 /// Probability that a value of `x` exceeds one of `y`, ties counted half (Mann–Whitney U over n·m); NaN when either
 /// is empty.
 pub fn probability_of_improvement(x: &[f64], y: &[f64]) -> f64 {
     let score = |a: f64, b: f64| {
-        if a > b {
-            1.0
-        } else {
-            f64::from(u8::from(a == b)) / 2.0
-        }
+        if a > b { 1.0 } else { f64::from(u8::from(a == b)) / 2.0 }
     };
-    let wins: f64 = x
-        .iter()
-        .flat_map(|&a| y.iter().map(move |&b| score(a, b)))
-        .sum();
+    let wins: f64 = x.iter().flat_map(|&a| y.iter().map(move |&b| score(a, b))).sum();
     wins / (x.len() * y.len()) as f64
 }
 
@@ -118,31 +106,20 @@ mod tests {
         // t(0.975; 2) = 4.302652729696142; mean 2, standard error 1/√3
         let interval = t_interval(&[1.0, 2.0, 3.0], 0.95).unwrap();
         let half = 4.302652729696142 / 3.0_f64.sqrt();
-        assert!(
-            (interval.high - 2.0 - half).abs() < 1e-9 && (2.0 - interval.low - half).abs() < 1e-9
-        );
+        assert!((interval.high - 2.0 - half).abs() < 1e-9 && (2.0 - interval.low - half).abs() < 1e-9);
         assert_eq!(t_interval(&[1.0], 0.95), None);
     }
 
     #[test]
     fn probability_of_improvement_counts_ties_half() {
-        assert_eq!(
-            probability_of_improvement(&[1.0, 2.0], &[0.0, 2.0]),
-            (1.0 + 0.0 + 1.0 + 0.5) / 4.0
-        );
+        assert_eq!(probability_of_improvement(&[1.0, 2.0], &[0.0, 2.0]), (1.0 + 0.0 + 1.0 + 0.5) / 4.0);
         assert_eq!(probability_of_improvement(&[3.0], &[1.0, 2.0]), 1.0);
         assert!(probability_of_improvement(&[], &[1.0]).is_nan());
     }
 
     #[test]
     fn nothing_is_not_a_number_and_no_panic() {
-        for value in [
-            mean(&[]),
-            sd(&[1.0]),
-            standard_error(&[]),
-            quantile(&[], 0.5),
-            iqm(&[]),
-        ] {
+        for value in [mean(&[]), sd(&[1.0]), standard_error(&[]), quantile(&[], 0.5), iqm(&[])] {
             assert!(value.is_nan());
         }
     }

@@ -86,11 +86,7 @@ pub enum StorageError {
 ///
 /// # Errors
 /// [`IoError::Exists`] without `force`; [`StorageError`] when the disk refuses.
-pub fn create(
-    path: &Path,
-    manifest: &Manifest,
-    force: bool,
-) -> Result<Box<dyn EpisodeSink>, StorageError> {
+pub fn create(path: &Path, manifest: &Manifest, force: bool) -> Result<Box<dyn EpisodeSink>, StorageError> {
     crate::io::refuse_existing(path, force)?;
     (format_of(path).build.create)(path, manifest, force)
 }
@@ -108,8 +104,5 @@ pub fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
 
 /// The first format that claims the path; Parquet when none does.
 fn format_of(path: &Path) -> &'static Entry<Format> {
-    FORMATS
-        .iter()
-        .find(|e| (e.build.claims)(path))
-        .unwrap_or(&FORMATS[FORMATS.len() - 1])
+    FORMATS.iter().find(|e| (e.build.claims)(path)).unwrap_or(&FORMATS[FORMATS.len() - 1])
 }

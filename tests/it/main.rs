@@ -1,1 +1,5 @@
 //! The one integration binary.
+
+mod links;
+mod record;
+mod worlds;
