@@ -1,5 +1,8 @@
 //! The one integration binary.
 
+mod figures;
 mod links;
 mod record;
+mod report;
+mod stats;
 mod worlds;
