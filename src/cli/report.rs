@@ -6,7 +6,15 @@ use clap::Args;
 
 use crate::cli::Outcome;
 use crate::cli::ui::{self, Format};
-use crate::report::{Request, Summary, collect, write};
+use crate::link::{self, Setting};
+use crate::record::{Recording, build_policy, returns};
+use crate::registry::Spec;
+use crate::report::{Collected, Reference, Request, Summary, collect, write};
+use crate::scenario;
+
+/// Episodes of each reference policy, and their seed: the same rows in every report.
+const REFERENCE_EPISODES: u64 = 400;
+const REFERENCE_SEED: u64 = 1;
 
 /// Tables, figures and one self-contained page from run directories.
 #[derive(Debug, Args)]
@@ -43,6 +51,31 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
     }
     ui::say(&format!("{} figures and the tables are on {}", summary.figures, summary.page.display()));
     Ok(Outcome::Done)
+}
+
+/// Returns of random policy and oracle on every task of the runs; a task that this build cannot play has none.
+fn references(collected: &Collected) -> Vec<Reference> {
+    let mut found = Vec::new();
+    for (task, spec) in collected.tasks() {
+        let play = |policy: &str| -> Result<Vec<f64>, crate::Error> {
+            let scenario = scenario::build(&spec)?;
+            let link = link::build(&Spec::new("none"), &Setting { distance_unit: scenario.link_unit() })?;
+            let policy = build_policy(&Spec::new(policy), scenario.as_ref())?;
+            let recording = Recording {
+                scenario: scenario.as_ref(),
+                link: link.as_ref(),
+                policy: policy.as_ref(),
+                seed: REFERENCE_SEED,
+                episodes: REFERENCE_EPISODES,
+            };
+            Ok(returns(&recording, 0, REFERENCE_EPISODES).into_iter().map(|r| r.episode_return).collect())
+        };
+        match play("random").and_then(|random| Ok((random, play("scripted")?))) {
+            Ok((random, oracle)) => found.push(Reference { task, random, oracle }),
+            Err(error) => ui::say(&format!("no reference rows for {task}: {error}")),
+        }
+    }
+    found
 }
 
 /// Mean return by algorithm and channel; the page has spreads and published values.

@@ -97,7 +97,10 @@ fn make_the_two_runs() {
     let dir = tempfile::tempdir().unwrap();
     report(&[fixture.join("runs")], &[], &dir.path().join("r")).unwrap();
     for name in MADE {
-        io_write(&fixture.join("expected").join(Path::new(name).file_name().unwrap()), &read(dir.path().join("r").join(name)));
+        io_write(
+            &fixture.join("expected").join(Path::new(name).file_name().unwrap()),
+            &read(dir.path().join("r").join(name)),
+        );
     }
 }
 
@@ -221,7 +224,7 @@ fn broken_tables_name_column_and_file() {
     parquet(&path, good.columns().to_vec());
     let bytes = std::fs::read(&path).unwrap();
     for length in [0, 3, bytes.len() / 2, bytes.len() - 1] {
-        std::fs::write(&path, &bytes[..length]).unwrap();
+        ccmarl::io::write_atomic(&path, &bytes[..length]).unwrap();
         let text = report(&[run.clone()], &[], &dir.path().join("r")).unwrap_err().to_string();
         assert!(text.starts_with("expected a Parquet file, found one that cannot be read"), "{length}: {text}");
     }
