@@ -43,7 +43,9 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
     crate::io::refuse_existing(&args.out, args.force).map_err(crate::Error::from)?;
     let collected = collect(&args.runs, &args.mi).map_err(crate::Error::from)?;
     let command = command_line(std::env::args_os().map(|a| a.to_string_lossy().into_owned()));
-    let request = Request { out: &args.out, force: args.force, title: &args.title, command: &command, references: &[] };
+    let references = references(&collected);
+    let request =
+        Request { out: &args.out, force: args.force, title: &args.title, command: &command, references: &references };
     let summary = write(&collected, &request).map_err(crate::Error::from)?;
     match args.format {
         Format::Json => ui::print_json(&summary.tidy())?,

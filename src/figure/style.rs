@@ -87,7 +87,7 @@ pub(super) fn color(index: usize) -> RGBColor {
 
 /// Text of a height, a colour and an anchor.
 pub(super) fn text(size: f64, color: RGBColor, h: HPos, v: VPos) -> TextStyle<'static> {
-    TextStyle::from(("sans-serif", size).into_font()).color(&color).pos(Pos::new(h, v))
+    TextStyle { color: color.to_backend_color(), ..TextStyle::from(("sans-serif", size).into_font()) }.pos(Pos::new(h, v))
 }
 
 /// A string from data, fit to be drawn: control characters escaped, cut after `limit` characters.
