@@ -2,4 +2,5 @@
 
 mod links;
 mod record;
+mod train;
 mod worlds;
