@@ -3,6 +3,7 @@
 
 mod args;
 mod evaluate;
+mod inspect;
 mod record;
 mod train;
 mod ui;
@@ -29,6 +30,8 @@ enum Command {
     Train(train::Args),
     /// Test a trained team on every channel of a suite
     Evaluate(evaluate::Args),
+    /// Show what a recorded store holds
+    Inspect(inspect::Args),
 }
 
 /// How a command ended, when it did not fail.
@@ -65,5 +68,6 @@ fn dispatch(command: Command) -> anyhow::Result<Outcome> {
         Command::Record(args) => record::run(&args),
         Command::Train(args) => train::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
+        Command::Inspect(args) => inspect::run(&args),
     }
 }

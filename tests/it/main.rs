@@ -2,5 +2,6 @@
 
 mod links;
 mod record;
+mod stores;
 mod train;
 mod worlds;
