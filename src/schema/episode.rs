@@ -139,7 +139,9 @@ impl Episode {
             if cfg!(target_endian = "little") {
                 hash.update(bytemuck::cast_slice::<f32, u8>(data));
             } else {
-                data.iter().for_each(|v| hash.update(v.to_le_bytes()));
+                for value in data {
+                    hash.update(value.to_le_bytes());
+                }
             }
         };
         for m in self.observations.iter().chain(&self.messages) {

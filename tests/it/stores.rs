@@ -556,6 +556,13 @@ fn make_interop_stores() {
     }
 }
 
+/// Processor seconds of this process so far, all threads, user and system (Linux counts them in hundredths).
+fn cpu() -> f64 {
+    let stat = fs::read_to_string("/proc/self/stat").unwrap();
+    let fields: Vec<&str> = stat.rsplit(')').next().unwrap().split_whitespace().collect();
+    (fields[11].parse::<f64>().unwrap() + fields[12].parse::<f64>().unwrap()) / 100.0
+}
+
 /// Speed of writing and reading rollouts as wide as simple_spread with three agents.
 #[test]
 #[ignore = "measures"]
@@ -566,16 +573,16 @@ fn speed() {
     for form in FORMS {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join(form);
-        let start = std::time::Instant::now();
+        let (start, before) = (std::time::Instant::now(), cpu());
         write(&path, &layout, &episodes, false).unwrap();
-        let wrote = start.elapsed().as_secs_f64();
-        let start = std::time::Instant::now();
+        let (wrote, wrote_cpu) = (start.elapsed().as_secs_f64(), cpu() - before);
+        let (start, before) = (std::time::Instant::now(), cpu());
         let mut source = storage::open(&path).unwrap();
         while source.next_episode().unwrap().is_some() {}
-        let took = start.elapsed().as_secs_f64();
+        let (took, took_cpu) = (start.elapsed().as_secs_f64(), cpu() - before);
         let files: Vec<PathBuf> =
             if path.is_dir() { fs::read_dir(&path).unwrap().map(|e| e.unwrap().path()).collect() } else { vec![path] };
         let bytes: u64 = files.iter().map(|f| f.metadata().unwrap().len()).sum();
-        println!("{form}: write {:.0} steps/s, read {:.0} steps/s, {} MB", steps / wrote, steps / took, bytes >> 20);
+        println!("{form}: write {:.0} steps/s ({wrote_cpu} s cpu), read {:.0} steps/s ({took_cpu} s cpu), {} MB", steps / wrote, steps / took, bytes >> 20);
     }
 }
