@@ -50,7 +50,7 @@ use crate::rng::{Seeds, Stream};
 use crate::schema::Samples;
 
 /// The registry's entry.
-pub const ENTRY: Entry<Build> = Entry {
+pub(super) const ENTRY: Entry<Build> = Entry {
     name: "jsd",
     summary: "Jensen-Shannon lower bound with its values in nats; the paper's choice for delivered messages",
     reference: "Hjelm et al. 2019, arXiv 1808.06670",
