@@ -169,11 +169,12 @@ fn a_damaged_parquet_file_is_an_error_and_never_a_panic() {
     ParquetWriter::new(&mut bytes).finish(&mut frame).unwrap();
     let options =
         ccmarl::pairs::TableOptions { x: vec!["a".to_owned()], y: vec!["b".to_owned()], ..Default::default() };
-    for at in (0..bytes.len()).step_by(bytes.len() / 60) {
+    let footer = u32::from_le_bytes(bytes[bytes.len() - 8..bytes.len() - 4].try_into().unwrap()) as usize;
+    for at in (bytes.len() - 8 - footer..bytes.len()).step_by(7) {
         let mut changed = bytes.clone();
         changed[at] ^= 0x55;
         ccmarl::io::write_atomic(&path, &changed).unwrap();
-        // a flip in the data itself cannot be seen without a checksum; whatever comes back, it comes back
+        // some flips change a name or a statistic that nobody reads; whatever comes back, it comes back
         drop(ccmarl::pairs::table(&path, &options));
         ccmarl::io::write_atomic(&path, &bytes[..at]).unwrap();
         assert!(ccmarl::pairs::table(&path, &options).is_err(), "truncated to {at} bytes");
