@@ -43,7 +43,7 @@ use crate::rng::{self, Seeds, Stream};
 use crate::schema::Samples;
 
 /// The registry's entry.
-pub const ENTRY: Entry<Build> = Entry {
+pub(super) const ENTRY: Entry<Build> = Entry {
     name: "club",
     summary: "contrastive log-ratio upper bound (vCLUB) with leave-one-out beside it; the paper's choice for lost messages",
     reference: "Cheng et al. 2020, arXiv 2006.12013",

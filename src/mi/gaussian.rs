@@ -40,7 +40,7 @@ use crate::rng::Seeds;
 use crate::schema::{Columns, Samples};
 
 /// The registry's entry.
-pub const ENTRY: Entry<Build> = Entry {
+pub(super) const ENTRY: Entry<Build> = Entry {
     name: "gaussian",
     summary: "log-determinants of covariances: exact for linear normal relations",
     reference: "bias: Misra, Singh, Demchuk 2005",

@@ -18,7 +18,8 @@
 //! # Parameters
 //!
 //! None. Critic: two ReLU layers of 64 and an embedding of 32 on either side, their dot product; 16 derangements;
-//! Adam 2e-3 falling to 0, weight decay 0.5, at most 600 steps of 256 pairs, stopped on the validation episodes.
+//! Adam 2e-3 falling to 0, weight decay 0.5, at most 600 steps of 256 pairs, stopped on the validation episodes, by
+//! which the scores are then shifted and scaled once.
 //!
 //! # When it fails
 //!
@@ -50,7 +51,7 @@ use crate::rng::{Seeds, Stream};
 use crate::schema::Samples;
 
 /// The registry's entry.
-pub const ENTRY: Entry<Build> = Entry {
+pub(super) const ENTRY: Entry<Build> = Entry {
     name: "jsd",
     summary: "Jensen-Shannon lower bound with its values in nats; the paper's choice for delivered messages",
     reference: "Hjelm et al. 2019, arXiv 1808.06670",
@@ -78,6 +79,15 @@ struct Trainee {
     values: Vec<f32>,
     grad_positive: Vec<f32>,
     grad_negative: Vec<f32>,
+}
+
+impl Trainee {
+    /// Corrects the scores in the tape; returns the mean value that they then have.
+    fn rescale(&mut self, scale: Scale) -> f64 {
+        let CriticTape { positive, negative, .. } = &mut self.tape;
+        positive.iter_mut().chain(negative.iter_mut()).for_each(|t| *t = scale.of(*t));
+        losses::jsd_values(positive, negative, &mut self.values)
+    }
 }
 
 impl Model for Trainee {
@@ -122,14 +132,20 @@ impl Estimator for Jsd {
         let diverged = || MiError::Diverged { columns: format!("{} and {}", samples.labels.x, samples.labels.y) };
         let Fit { params, steps, .. } = fit(&mut model, &data, seeds).ok_or_else(diverged)?;
         let (mut x, mut y) = (Vec::new(), Vec::new());
+        gather(&data.x, data.x_width, &data.validation, &mut x);
+        gather(&data.y, data.y_width, &data.validation, &mut y);
+        model.score(&params, &x, &y, data.validation.len(), &mut seeds.stream("validation score"));
+        let scale = if steps == 0 { Scale { slope: 1.0, offset: 0.0 } } else { Scale::fit(&model.tape) };
         let held_out = data.train.len().min(data.test.len());
         gather(&data.x, data.x_width, &data.train[..held_out], &mut x);
         gather(&data.y, data.y_width, &data.train[..held_out], &mut y);
-        let trained_on = model.score(&params, &x, &y, held_out, &mut seeds.stream("train score"));
+        model.score(&params, &x, &y, held_out, &mut seeds.stream("train score"));
+        let trained_on = model.rescale(scale);
         gather(&data.x, data.x_width, &data.test, &mut x);
         gather(&data.y, data.y_width, &data.test, &mut y);
         model.score(&params, &x, &y, data.test.len(), &mut seeds.stream("test score"));
-        let held = Held::new(&model, &data);
+        model.rescale(scale);
+        let held = Held::new(&model, &data, scale);
         let p = held.p_value(samples, &model.critic, &params, &data, protocol, seeds);
         let mut rows = held.rows(samples);
         if rows.iter().any(|r| !r.value.is_finite()) {
@@ -156,6 +172,51 @@ impl Estimator for Jsd {
     }
 }
 
+/// A correction of the critic's scores, T ← slope T + offset: logistic regression on the validation part. Without it
+/// E_p\[T\] inherits the level at which training happened to stop.
+#[derive(Clone, Copy, Debug)]
+struct Scale {
+    slope: f32,
+    offset: f32,
+}
+
+impl Scale {
+    fn of(self, t: f32) -> f32 {
+        self.slope * t + self.offset
+    }
+
+    /// Maximises `jsd` on the scores in the tape by Newton's method, held to (1, 0) by the weight of one pair.
+    fn fit(tape: &CriticTape) -> Self {
+        let pairs = || tape.positive.iter().map(|&t| (t, 1.0, 1.0));
+        let others = || tape.negative.iter().map(|&t| (t, 0.0, 1.0 / NEGATIVES as f64));
+        let (mut slope, mut offset) = (1.0, 0.0);
+        for _ in 0..20 {
+            let (mut gradient, mut hessian) = ([slope - 1.0, offset], [1.0, 0.0, 1.0]);
+            for (t, label, weight) in pairs().chain(others()) {
+                let t = f64::from(t);
+                let p = 1.0 / (1.0 + libm::exp(-slope * t - offset));
+                let (error, curvature) = (weight * (p - label), weight * p * (1.0 - p));
+                gradient = [gradient[0] + error * t, gradient[1] + error];
+                hessian = [hessian[0] + curvature * t * t, hessian[1] + curvature * t, hessian[2] + curvature];
+            }
+            let determinant = hessian[0] * hessian[2] - hessian[1] * hessian[1];
+            let step = [
+                (hessian[2] * gradient[0] - hessian[1] * gradient[1]) / determinant,
+                (hessian[0] * gradient[1] - hessian[1] * gradient[0]) / determinant,
+            ];
+            (slope, offset) = (slope - step[0].clamp(-0.5, 0.5), offset - step[1].clamp(-0.5, 0.5));
+            if step[0].abs() + step[1].abs() < 1e-9 {
+                break;
+            }
+        }
+        if slope.is_finite() && offset.is_finite() {
+            Self { slope: slope as f32, offset: offset as f32 }
+        } else {
+            Self { slope: 1.0, offset: 0.0 }
+        }
+    }
+}
+
 /// The critic's scores on the test part, and what they average to.
 struct Held<'a> {
     positive: &'a [f32],
@@ -163,15 +224,16 @@ struct Held<'a> {
     exponential: Vec<f64>,
     blocks: &'a [u32],
     jsd: Interval,
+    scale: Scale,
 }
 
 impl<'a> Held<'a> {
-    fn new(model: &'a Trainee, data: &'a Prepared) -> Self {
+    fn new(model: &'a Trainee, data: &'a Prepared, scale: Scale) -> Self {
         let values: Vec<f64> = model.values.iter().map(|&v| f64::from(v)).collect();
         let mean = |t: &[f32]| t.iter().map(|&t| libm::exp(f64::from(t))).sum::<f64>() / t.len() as f64;
         let exponential = model.tape.negative.chunks_exact(NEGATIVES).map(mean).collect();
         let jsd = block_interval(&values, &data.test_blocks);
-        Self { positive: &model.tape.positive, exponential, blocks: &data.test_blocks, jsd }
+        Self { positive: &model.tape.positive, exponential, blocks: &data.test_blocks, jsd, scale }
     }
 
     fn rows(&self, samples: &Samples) -> Vec<Estimate> {
@@ -228,7 +290,7 @@ impl<'a> Held<'a> {
         let statistic = |rows: &[u32]| {
             let score = |(y, &r): (&[f32], &u32)| {
                 let at = place[r as usize] as usize * width;
-                f64::from(-losses::softplus(-dot(y, &ex[at..at + width])))
+                f64::from(-losses::softplus(-self.scale.of(dot(y, &ex[at..at + width]))))
             };
             ey.chunks_exact(width).zip(rows).map(score).sum::<f64>()
         };

@@ -64,7 +64,7 @@ fn compare(results: &mut [JobResult]) {
         .max_by(|a, b| a.0.total_cmp(&b.0));
     let Some((low, name)) = lower else { return };
     for row in results.iter_mut().flat_map(|r| r.rows.iter_mut().flatten()) {
-        if row.kind == Kind::UpperBound && row.value < low {
+        if row.kind == Kind::UpperBound && row.value + 1e-3 < low {
             row.warnings.push(format!("below the lower bound {name} ({low:.3}): q fits badly, this is no upper bound"));
         }
     }

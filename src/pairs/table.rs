@@ -2,14 +2,11 @@
 
 use std::fs::File;
 use std::io::Read as _;
-use std::num::NonZeroUsize;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::sync::Arc;
 
-use polars::prelude::{
-    Column, CsvReadOptions, DataFrame, DataType, ParquetReader, PolarsResult, SerReader as _,
-};
+use polars::prelude::{Column, CsvReadOptions, DataFrame, DataType, ParquetReader, PolarsError, SerReader as _};
 
 use super::PairsError;
 use crate::io::IoError;
@@ -43,16 +40,14 @@ pub fn is_store(path: &Path) -> Result<bool, PairsError> {
     if path.is_dir() || path.extension().is_some_and(|e| e.eq_ignore_ascii_case("mcap")) {
         return Ok(true);
     }
-    if form(path)? != "Parquet" {
-        return Ok(false);
-    }
-    let file = File::open(path).map_err(IoError::os("open", path))?;
-    let keys = guarded("Parquet", path, || {
-        let mut reader = ParquetReader::new(file);
-        let metadata = reader.get_metadata()?;
+    caught(path, |form| {
+        if form != "Parquet" {
+            return Ok(false);
+        }
+        let mut reader = ParquetReader::new(File::open(path).map_err(IoError::os("open", path))?);
+        let metadata = reader.get_metadata().map_err(unreadable(form, path))?;
         Ok(metadata.key_value_metadata().iter().flatten().any(|kv| kv.key == "ccmarl.manifest"))
-    })?;
-    Ok(keys)
+    })
 }
 
 /// Samples from the named columns. Rows with a missing value are left out and counted in the notes.
@@ -63,9 +58,13 @@ pub fn table(path: &Path, options: &TableOptions) -> Result<Samples, PairsError>
     if !path.exists() {
         return Err(IoError::Missing(path.to_owned()).into());
     }
+    caught(path, |form| samples(path, form, options))
+}
+
+fn samples(path: &Path, form: &'static str, options: &TableOptions) -> Result<Samples, PairsError> {
     let keys = options.group.iter().chain(&options.time);
     let wanted: Vec<&str> = options.x.iter().chain(&options.y).chain(keys).map(String::as_str).collect();
-    let frame = read(path, &wanted)?;
+    let frame = read(path, form, &wanted)?;
     let (x, y) = (numbers(&frame, &options.x, path)?, numbers(&frame, &options.y, path)?);
     let height = frame.height();
     let group = options.group.as_deref().map(|name| texts(&frame, name, path)).transpose()?;
@@ -145,34 +144,37 @@ fn form(path: &Path) -> Result<&'static str, IoError> {
     Ok(if named || magic[..read] == *b"PAR1" { "Parquet" } else { "CSV" })
 }
 
-/// Runs a reader of foreign files; its errors and its panics become errors of ours.
-fn guarded<T>(form: &'static str, path: &Path, read: impl FnOnce() -> PolarsResult<T>) -> Result<T, PairsError> {
+/// Runs what touches a foreign file's data; a panic in there becomes an error of ours.
+fn caught<T>(path: &Path, read: impl FnOnce(&'static str) -> Result<T, PairsError>) -> Result<T, PairsError> {
+    let form = form(path)?;
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(|_| ()));
-    let result = catch_unwind(AssertUnwindSafe(read));
+    let result = catch_unwind(AssertUnwindSafe(|| read(form)));
     std::panic::set_hook(hook);
-    let message = match result {
-        Ok(Ok(value)) => return Ok(value),
-        Ok(Err(error)) => error.to_string().lines().next().unwrap_or_default().to_owned(),
-        Err(_) => "the file is damaged".to_owned(),
-    };
-    Err(PairsError::Unreadable { form, message, path: path.to_owned() })
+    result.unwrap_or_else(|_| {
+        Err(PairsError::Unreadable { form, message: "the file is damaged".to_owned(), path: path.to_owned() })
+    })
+}
+
+/// The first line of what polars has to say.
+fn unreadable(form: &'static str, path: &Path) -> impl Fn(PolarsError) -> PairsError {
+    let path = path.to_owned();
+    move |error| {
+        let message = error.to_string().lines().next().unwrap_or_default().to_owned();
+        PairsError::Unreadable { form, message, path: path.clone() }
+    }
 }
 
 /// The wanted columns of the file.
-fn read(path: &Path, wanted: &[&str]) -> Result<DataFrame, PairsError> {
-    let form = form(path)?;
+fn read(path: &Path, form: &'static str, wanted: &[&str]) -> Result<DataFrame, PairsError> {
     let open = || File::open(path).map_err(IoError::os("open", path));
+    let unreadable = unreadable(form, path);
     let names: Vec<String> = if form == "Parquet" {
-        let file = open()?;
-        guarded(form, path, || {
-            let schema = ParquetReader::new(file).schema()?;
-            Ok(schema.iter_names().map(ToString::to_string).collect())
-        })?
+        let schema = ParquetReader::new(open()?).schema().map_err(&unreadable)?;
+        schema.iter_names().map(ToString::to_string).collect()
     } else {
         let options = CsvReadOptions::default().with_n_rows(Some(0)).with_infer_schema_length(Some(0));
-        let file = open()?;
-        let frame = guarded(form, path, || options.into_reader_with_file_handle(file).finish())?;
+        let frame = options.into_reader_with_file_handle(open()?).finish().map_err(&unreadable)?;
         frame.get_column_names().into_iter().map(ToString::to_string).collect()
     };
     if let Some(&name) = wanted.iter().find(|w| !names.iter().any(|n| n == *w)) {
@@ -182,18 +184,16 @@ fn read(path: &Path, wanted: &[&str]) -> Result<DataFrame, PairsError> {
     let mut columns: Vec<&str> = wanted.to_vec();
     columns.sort_unstable();
     columns.dedup();
-    let file = open()?;
-    guarded(form, path, || {
-        if form == "Parquet" {
-            let columns = columns.iter().map(|c| (*c).to_owned()).collect();
-            ParquetReader::new(file).with_columns(Some(columns)).finish()
-        } else {
-            // the whole file decides a column's type: a float in the last row must not be an error
-            let columns = columns.iter().map(|&c| c.into()).collect();
-            let options = CsvReadOptions::default().with_infer_schema_length(None).with_columns(Some(columns));
-            options.with_infer_schema_files(NonZeroUsize::MIN).into_reader_with_file_handle(file).finish()
-        }
-    })
+    let frame = if form == "Parquet" {
+        let columns = columns.iter().map(|c| (*c).to_owned()).collect();
+        ParquetReader::new(open()?).with_columns(Some(columns)).finish()
+    } else {
+        // the whole file decides a column's type: a float in the last row must not be an error
+        let columns = columns.iter().map(|&c| c.into()).collect();
+        let options = CsvReadOptions::default().with_infer_schema_length(None).with_columns(Some(columns));
+        options.into_reader_with_file_handle(open()?).finish()
+    };
+    frame.map_err(unreadable)
 }
 
 fn is_numeric(kind: &DataType) -> bool {
@@ -201,12 +201,7 @@ fn is_numeric(kind: &DataType) -> bool {
 }
 
 fn column<'a>(frame: &'a DataFrame, name: &str, path: &Path) -> Result<&'a Column, PairsError> {
-    let unreadable = |e: polars::prelude::PolarsError| PairsError::Unreadable {
-        form: "table",
-        message: e.to_string(),
-        path: path.to_owned(),
-    };
-    frame.column(name).map_err(unreadable)
+    frame.column(name).map_err(unreadable("table", path))
 }
 
 fn not_numeric(frame: &DataFrame, column: &Column, path: &Path) -> PairsError {

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
-use polars::prelude::{Column, DataFrame, ParquetReader, ParquetWriter, SerReader as _};
+use polars::prelude::{Column, DataFrame, NamedFrom as _, ParquetReader, ParquetWriter, SerReader as _, Series};
 use serde_json::Value;
 
 fn run(args: &[&str]) -> (i32, String, String) {
@@ -133,13 +133,12 @@ fn missing_values_are_counted_copies_are_infinite_and_strict_fails_on_warnings()
 fn parquet_with_vectors_and_nulls_reads_as_its_columns_and_the_three_outputs_agree() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("v.parquet");
-    let n = 50;
+    let n = 50_usize;
     let a: Vec<Option<f32>> = (0..n).map(|i| (i != 3).then_some((i * 7 % n) as f32)).collect();
     let b: Vec<bool> = (0..n).map(|i| i * 7 % n > 20).collect();
-    let inner: Vec<polars::prelude::Series> =
-        (0..n).map(|i| polars::prelude::Series::new("".into(), [f64::from(i * 7 % n), f64::from(i % 5)])).collect();
+    let inner: Vec<Series> = (0..n).map(|i| Series::new("".into(), [(i * 7 % n) as f64, (i % 5) as f64])).collect();
     let columns = vec![Column::new("a".into(), a), Column::new("b".into(), b), Column::new("v".into(), inner)];
-    let mut frame = DataFrame::new(n as usize, columns).unwrap();
+    let mut frame = DataFrame::new(n, columns).unwrap();
     ParquetWriter::new(std::fs::File::create(&path).unwrap()).finish(&mut frame).unwrap();
     let file = path.to_string_lossy().into_owned();
     let out = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
@@ -156,7 +155,7 @@ fn parquet_with_vectors_and_nulls_reads_as_its_columns_and_the_three_outputs_agr
     let csv = std::fs::read_to_string(out("r.csv")).unwrap();
     assert_eq!(csv.lines().next().unwrap(), keys.join(","));
     let frame = ParquetReader::new(std::fs::File::open(PathBuf::from(out("r.parquet"))).unwrap()).finish().unwrap();
-    assert_eq!(frame.get_column_names_str(), keys);
+    assert_eq!(frame.get_column_names().iter().map(ToString::to_string).collect::<Vec<_>>(), keys);
     assert_eq!(frame.height(), 1);
 }
 
@@ -170,11 +169,12 @@ fn a_damaged_parquet_file_is_an_error_and_never_a_panic() {
     ParquetWriter::new(&mut bytes).finish(&mut frame).unwrap();
     let options =
         ccmarl::pairs::TableOptions { x: vec!["a".to_owned()], y: vec!["b".to_owned()], ..Default::default() };
-    for at in (0..bytes.len()).step_by(bytes.len() / 60) {
+    let footer = u32::from_le_bytes(bytes[bytes.len() - 8..bytes.len() - 4].try_into().unwrap()) as usize;
+    for at in (bytes.len() - 8 - footer..bytes.len()).step_by(7) {
         let mut changed = bytes.clone();
         changed[at] ^= 0x55;
         ccmarl::io::write_atomic(&path, &changed).unwrap();
-        // a flip in the data itself cannot be seen without a checksum; whatever comes back, it comes back
+        // some flips change a name or a statistic that nobody reads; whatever comes back, it comes back
         drop(ccmarl::pairs::table(&path, &options));
         ccmarl::io::write_atomic(&path, &bytes[..at]).unwrap();
         assert!(ccmarl::pairs::table(&path, &options).is_err(), "truncated to {at} bytes");
