@@ -82,6 +82,7 @@ impl Draw for Figure<'_> {
     fn draw<DB: DrawingBackend>(&self, area: &Area<DB>) -> Drawn<DB> {
         let below = style::header(area, &self.data.title, &self.data.subtitle, &self.colors, &self.data.references)?;
         let mut chart = ChartBuilder::on(&below)
+            .margin_left(26)
             .margin_right(30)
             .margin_bottom(10)
             .x_label_area_size(88)

@@ -85,6 +85,7 @@ impl Draw for Figure<'_> {
     fn draw<DB: DrawingBackend>(&self, area: &Area<DB>) -> Drawn<DB> {
         let below = style::header(area, &self.data.title, &self.data.subtitle, &self.colors, &self.data.references)?;
         let mut chart = ChartBuilder::on(&below)
+            .margin_left(26)
             .margin_right(50)
             .margin_bottom(16)
             .x_label_area_size(88)
@@ -104,7 +105,7 @@ impl Draw for Figure<'_> {
                 chart.draw_series(std::iter::once(Polygon::new(outline, color.mix(0.18))))?;
             }
             let line = curve.points.iter().map(|p| (p.step, p.value));
-            chart.draw_series(LineSeries::new(line, color.stroke_width(if band.is_empty() { 3 } else { 5 })))?;
+            chart.draw_series(LineSeries::new(line, color.stroke_width(if band.is_empty() { 4 } else { 6 })))?;
         }
         Ok(())
     }

@@ -108,6 +108,9 @@ impl Figure<'_> {
         }
         let axis = style::text(style::TICK, style::SOFT, HPos::Center, VPos::Top);
         area.draw_text("receiver", &axis, (left + across / 2, ABOVE + down + 50))?;
+        let upright =
+            style::text(style::TICK, style::SOFT, HPos::Center, VPos::Top).transform(FontTransform::Rotate270);
+        area.draw_text("sender", &upright, (left - LEFT + 12, ABOVE + down / 2))?;
         for (s, sender) in self.senders.iter().enumerate() {
             let top = ABOVE + tall * s as i32;
             let style = style::text(tick, style::INK, HPos::Right, VPos::Center);
@@ -181,6 +184,6 @@ mod tests {
         let light = |c: RGBColor| 0.2126 * f64::from(c.0) + 0.7152 * f64::from(c.1) + 0.0722 * f64::from(c.2);
         let steps: Vec<f64> = (0..=30).map(|i| light(shade(f64::from(i) / 30.0))).collect();
         assert!(steps.windows(2).all(|w| w[1] < w[0]), "{steps:?}");
-        assert_eq!((shade(f64::NAN).0, shade(2.0).0), (247, 8), "out of the scale is held at its ends");
+        assert_eq!((shade(-1.0).0, shade(2.0).0), (247, 8), "out of the scale is held at its ends");
     }
 }

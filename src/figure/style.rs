@@ -87,7 +87,8 @@ pub(super) fn color(index: usize) -> RGBColor {
 
 /// Text of a height, a colour and an anchor.
 pub(super) fn text(size: f64, color: RGBColor, h: HPos, v: VPos) -> TextStyle<'static> {
-    TextStyle { color: color.to_backend_color(), ..TextStyle::from(("sans-serif", size).into_font()) }.pos(Pos::new(h, v))
+    TextStyle { color: color.to_backend_color(), ..TextStyle::from(("sans-serif", size).into_font()) }
+        .pos(Pos::new(h, v))
 }
 
 /// A string from data, fit to be drawn: control characters escaped, cut after `limit` characters.
@@ -150,10 +151,10 @@ pub(super) fn header<DB: DrawingBackend>(
         if dash {
             for k in 0..3 {
                 let from = x + 18 * k;
-                area.draw(&Rectangle::new([(from, y + 15), (from + 11, y + 18)], color.filled()))?;
+                area.draw(&Rectangle::new([(from, y + 9), (from + 11, y + 12)], color.filled()))?;
             }
         } else {
-            area.draw(&Rectangle::new([(x, y + 4), (x + 44, y + 29)], color.filled()))?;
+            area.draw(&Rectangle::new([(x, y - 2), (x + 44, y + 22)], color.filled()))?;
         }
         area.draw_text(&name, &style, (x + 58, y))?;
         x += 58 + long + 44;

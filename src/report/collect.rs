@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use crate::io::{IoError, read_text, sha256_file};
+use crate::io::{IoError, printable, read_text, sha256_file};
 use crate::registry::Spec;
 use crate::report::ReportError;
 use crate::report::columns::Columns;
@@ -298,7 +298,7 @@ fn read_evaluation(path: &Path, run: &mut Run) -> Result<(), ReportError> {
     for (what, column, config) in
         [("scenario", "scenario", &run.task.scenario), ("algorithm", "algorithm", &run.algorithm)]
     {
-        if let Some(other) = table.text(column)?.iter().find(|v| *v != config) {
+        if let Some(other) = table.text(column)?.iter().find(|v| **v != printable(config)) {
             return Err(differs(what, config, other));
         }
     }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use polars::prelude::{Column, DataFrame, DataType, ParquetReader, SerReader as _};
 
-use crate::io::IoError;
+use crate::io::{IoError, printable};
 use crate::report::ReportError;
 
 /// A table and where it came from.
@@ -103,10 +103,10 @@ impl Columns {
         self.filled(name, "a whole number", values)
     }
 
-    /// Text, null where null.
+    /// Text, null where null; control characters escaped, so that nothing downstream can be steered by them.
     pub(super) fn text_or_null(&self, name: &'static str) -> Result<Vec<Option<String>>, ReportError> {
         let column = self.cast(name, "text", |t| *t == DataType::String, &DataType::String)?;
-        Ok(self.internal(column.str())?.iter().map(|v| v.map(str::to_owned)).collect())
+        Ok(self.internal(column.str())?.iter().map(|v| v.map(printable)).collect())
     }
 
     /// Text.

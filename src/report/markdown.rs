@@ -179,7 +179,7 @@ mod tests {
 
     #[test]
     fn hostile_text_stays_text() {
-        assert_eq!(escape("a|b<script>*x*\n"), "a\\|b&lt;script&gt;\\*x\\*\\n");
+        assert_eq!(escape("a|b<script>*x*\n"), "a\\|b&lt;script&gt;\\*x\\*\\\\n");
         assert_eq!(
             csv(&["a", "b"], std::iter::once(vec!["x,\"y\"".to_owned(), "z".to_owned()])),
             "a,b\n\"x,\"\"y\"\"\",z\n"

@@ -3,6 +3,7 @@
 
 use askama::Template as _;
 
+use crate::io::printable;
 use crate::report::markdown::Grid;
 use crate::report::{ReportError, Run};
 
@@ -72,12 +73,12 @@ pub(super) fn html(
     command: &str,
 ) -> Result<String, ReportError> {
     let origin = |r: &Run| Origin {
-        path: r.path.display().to_string(),
-        algorithm: r.algorithm.clone(),
-        prior: r.prior.to_string(),
+        path: printable(&r.path.display().to_string()),
+        algorithm: printable(&r.algorithm),
+        prior: printable(&r.prior.to_string()),
         seed: r.seed,
         steps: r.steps,
-        ccmarl: r.ccmarl.clone(),
+        ccmarl: printable(&r.ccmarl),
         config: r.config_sha256.chars().take(12).collect(),
     };
     let origins = runs.iter().map(origin).collect();

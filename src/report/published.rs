@@ -104,7 +104,7 @@ fn agents_in_paper(task: &Task) -> i64 {
 
 /// The coefficients (β, α) of a run, where its configuration names them.
 pub(super) fn coefficients(run: &Run) -> (Option<f64>, Option<f64>) {
-    let get = |key: &str| run.settings.get(&format!("maddpg.{key}")).and_then(|v| v.parse().ok());
+    let get = |key: &str| run.settings.get(&format!("dumie.{key}")).and_then(|v| v.parse().ok());
     (get("beta"), get("alpha"))
 }
 

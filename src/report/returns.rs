@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
+use crate::io::printable;
 use crate::report::published::{coefficients, misprints};
 use crate::report::{Published, ReportError, Run, Tables, Task};
 use crate::stats::{Interval, mean, sd, t_interval};
@@ -165,12 +166,13 @@ fn label(
             }
         }
     }
+    let name = printable(name);
     if differing.is_empty() {
-        return name.to_owned();
+        return name;
     }
     let words: Vec<String> =
         differing.iter().map(|(key, value)| format!("{}={value}", key.strip_prefix("dumie.").unwrap_or(key))).collect();
-    format!("{name} ({})", words.join(", "))
+    format!("{name} ({})", printable(&words.join(", ")))
 }
 
 /// The table of one task's runs; `None` when none was evaluated.

@@ -195,7 +195,7 @@ fn task_section(
     let lines = reference.map_or_else(Vec::new, |r| {
         let line = |name: &str, values: &[f64]| {
             let value = crate::stats::mean(values);
-            let label = format!("{name} policy {value:.1}");
+            let label = format!("{name} policy {value:.1}").replace('-', "−");
             (!values.is_empty()).then_some(figure::Reference { label, value })
         };
         line("random", &r.random).into_iter().chain(line("oracle", &r.oracle)).collect()
