@@ -1,6 +1,7 @@
 //! The crate's error: one enum per room, wrapped here, and the exit code each deserves.
 
 use crate::io::IoError;
+use crate::record::RecordError;
 use crate::registry::RegistryError;
 use crate::schema::SchemaError;
 use crate::storage::StorageError;
@@ -14,6 +15,9 @@ pub enum Error {
     /// A plugin's name or parameters.
     #[error(transparent)]
     Registry(#[from] RegistryError),
+    /// Recording.
+    #[error(transparent)]
+    Record(#[from] RecordError),
     /// Data against the schema.
     #[error(transparent)]
     Schema(#[from] SchemaError),
@@ -25,6 +29,10 @@ pub enum Error {
 impl Error {
     /// Whether the user's words are at fault (exit code 2), not the data or the machine (exit code 1).
     pub fn is_usage(&self) -> bool {
-        matches!(self, Self::Registry(_) | Self::Io(IoError::Exists(_)))
+        match self {
+            Self::Registry(_) | Self::Io(IoError::Exists(_)) | Self::Record(RecordError::NoEpisodes) => true,
+            Self::Storage(StorageError::Io(IoError::Exists(_))) => true,
+            _ => false,
+        }
     }
 }

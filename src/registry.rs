@@ -109,6 +109,17 @@ impl Spec {
             .map_err(|e| RegistryError::Params { name: self.name.clone(), message: e.to_string() })
     }
 
+    /// Checks that the parameter `key` lies in `[low, high]`.
+    ///
+    /// # Errors
+    /// [`RegistryError::Params`] that names the range and what was found.
+    pub fn in_range(&self, key: &str, value: f64, low: f64, high: f64) -> Result<(), RegistryError> {
+        if value >= low && value <= high {
+            return Ok(());
+        }
+        Err(self.invalid(format!("{key} must be in [{low}, {high}], found {value}")))
+    }
+
     /// An error about this plugin's parameters.
     pub fn invalid(&self, message: impl Into<String>) -> RegistryError {
         RegistryError::Params { name: self.name.clone(), message: message.into() }

@@ -46,6 +46,11 @@ impl Seeds {
         Self { key: hash.finalize().into() }
     }
 
+    /// A seed for another tree that belongs below this node.
+    pub fn seed(&self) -> u64 {
+        self.key.iter().take(8).fold(0, |seed, &byte| (seed << 8) | u64::from(byte))
+    }
+
     /// A fresh stream, at its start, named `name` below this node.
     pub fn stream(&self, name: &str) -> Stream {
         ChaCha8Rng::from_seed(self.child(name).key)

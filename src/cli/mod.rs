@@ -3,6 +3,7 @@
 
 mod generate;
 mod list;
+mod record;
 mod ui;
 
 use std::process::ExitCode;
@@ -25,6 +26,8 @@ enum Command {
     List(list::Args),
     /// Generate shell completions or manual pages
     Generate(generate::Args),
+    /// Record episodes of a scenario under a policy and a link
+    Record(record::Args),
 }
 
 /// How a command ended, when it did not fail.
@@ -60,5 +63,6 @@ fn dispatch(command: Command) -> anyhow::Result<Outcome> {
     match command {
         Command::List(args) => list::run(&args),
         Command::Generate(args) => generate::run(&args),
+        Command::Record(args) => record::run(&args),
     }
 }

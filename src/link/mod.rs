@@ -4,13 +4,23 @@
 //! stream, so the same bits come out for any thread and agent order. Adding one: write `link/<name>.rs` with an
 //! `ENTRY`, and add `mod <name>;` and `<name>::ENTRY,` below.
 
+mod distance;
+mod dropout;
+mod markov;
+mod none;
+mod perfect;
+mod suite;
+
+use serde::Serialize;
 use serde_json::{Map, Value};
 
+pub use suite::{Channel, SUITES, channel, suite};
+
 use crate::registry::{Entry, RegistryError, Spec};
-use crate::rng::Seeds;
+use crate::rng::{Seeds, Stream};
 
 /// All links.
-pub const LINKS: &[Entry<Build>] = &[];
+pub const LINKS: &[Entry<Build>] = &[perfect::ENTRY, none::ENTRY, dropout::ENTRY, markov::ENTRY, distance::ENTRY];
 
 /// What a link may want to know about the scenario it is used in.
 #[derive(Clone, Copy, Debug)]
@@ -57,4 +67,38 @@ pub(crate) fn for_each_link(n: usize, mut f: impl FnMut(usize, usize, usize)) {
             }
         }
     }
+}
+
+/// One stream per directed link among `n`, in row-major order. The stream of a pair is the same for every `n`.
+fn streams(n: usize, seeds: &Seeds) -> Vec<Stream> {
+    let mut streams = Vec::with_capacity(n * n.saturating_sub(1));
+    for s in 0..n {
+        let sender = seeds.indexed("sender", s as u64);
+        streams.extend((0..n).filter(|&r| r != s).map(|r| sender.indexed_stream("receiver", r as u64)));
+    }
+    streams
+}
+
+/// Parameters as the manifest records them: the name, then every field.
+fn resolved(name: &str, parameters: &impl Serialize) -> Map<String, Value> {
+    let mut map = Map::new();
+    map.insert("name".to_owned(), Value::from(name));
+    if let Ok(Value::Object(fields)) = serde_json::to_value(parameters) {
+        map.extend(fields);
+    }
+    map
+}
+
+/// The bits of `rows` rows of one episode of a link, for tests.
+#[cfg(test)]
+fn emit_rows(link: &dyn Link, n: usize, rows: usize, episode: u64) -> Vec<Vec<bool>> {
+    let mut state = link.start(n, &Seeds::new(1).indexed("episode", episode));
+    let positions: Vec<[f64; 2]> = (0..n).map(|i| [i as f64, 0.0]).collect();
+    let emit = |_| {
+        let mut bits = vec![false; n * n];
+        state.emit(&positions, &mut bits);
+        assert!((0..n).all(|i| bits[i * n + i]), "the diagonal is true");
+        bits
+    };
+    (0..rows).map(emit).collect()
 }

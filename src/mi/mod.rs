@@ -1,1 +1,8 @@
 //! Mutual information.
+
+pub mod conditional;
+pub mod critic;
+pub mod losses;
+mod negatives;
+
+pub use negatives::{all_others, derangements};

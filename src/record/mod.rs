@@ -1,13 +1,41 @@
 //! Recording: scenario × policy × link → episodes, parallel over episodes, the same bytes for any number of threads.
 
+mod probe;
+mod random;
+mod rollout;
+mod scripted;
+
 use serde_json::{Map, Value};
+
+pub use rollout::{EpisodeReturn, Options, Recorded, Recording, loss_rate, returns};
 
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
 use crate::scenario::{Scenario, World};
+use crate::schema::{AgentSpec, Controller};
+use crate::storage::StorageError;
 
 /// All policies that can be recorded.
-pub const POLICIES: &[Entry<Build>] = &[];
+pub const POLICIES: &[Entry<Build>] = &[random::ENTRY, scripted::ENTRY, probe::ENTRY];
+
+/// What goes wrong when recording.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordError {
+    /// Nothing to record.
+    #[error("expected at least 1 episode, found 0: give --episodes")]
+    NoEpisodes,
+    /// The store.
+    #[error(transparent)]
+    Storage(#[from] StorageError),
+    /// The operating system gave no threads.
+    #[error("could not start {threads} threads: {reason}: give fewer with --threads")]
+    Threads {
+        /// How many were asked for; 0 for one per core.
+        threads: usize,
+        /// The reason given.
+        reason: String,
+    },
+}
 
 /// Builds a policy for a scenario.
 pub type Build = fn(&Spec, &dyn Scenario) -> Result<Box<dyn Policy>, RegistryError>;
@@ -54,4 +82,27 @@ pub trait PolicyEpisode {
 
     /// Writes the actions of all agents under policy control into the flat `[Σ action]` buffer.
     fn act(&mut self, view: &View<'_>, actions: &mut [f32]);
+}
+
+/// Copies each sender's observation into its message: the default content of messages.
+pub fn send_observations(agents: &[AgentSpec], observations: &[f32], messages: &mut [f32]) {
+    let (mut o, mut m) = (0, 0);
+    for agent in agents {
+        messages[m..m + agent.message].copy_from_slice(&observations[o..o + agent.message]);
+        o += agent.observation;
+        m += agent.message;
+    }
+}
+
+/// Where the actions of each agent under policy control lie in the flat buffer.
+fn policy_actions(agents: &[AgentSpec]) -> Vec<std::ops::Range<usize>> {
+    let offsets = crate::scenario::offsets(agents, |a| a.action);
+    let spans = offsets.windows(2).map(|w| w[0]..w[1]);
+    spans.zip(agents).filter(|(_, a)| a.controller == Controller::Policy).map(|(span, _)| span).collect()
+}
+
+/// Parameters as the manifest records them: the name, then the given fields.
+fn resolved(name: &str, fields: &[(&str, Value)]) -> Map<String, Value> {
+    let fields = fields.iter().map(|(k, v)| ((*k).to_owned(), v.clone()));
+    std::iter::once(("name".to_owned(), Value::from(name))).chain(fields).collect()
 }

@@ -3,18 +3,26 @@
 //! A scenario is immutable after it is built; all that changes during an episode is in [`World`]. Adding one: write
 //! `scenario/<name>.rs` with an `ENTRY`, and add `mod <name>;` and `<name>::ENTRY,` below.
 
+mod decoder;
+mod simple_spread;
+mod simple_tag;
 mod world;
 
+use serde::Serialize;
 use serde_json::{Map, Value};
 
-pub use world::World;
+pub use decoder::Decoder;
+pub use world::{Body, Integration, Laws, Physics, World};
 
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Stream;
 use crate::schema::{AgentSpec, Layout};
 
 /// All scenarios.
-pub const SCENARIOS: &[Entry<Build>] = &[];
+pub const SCENARIOS: &[Entry<Build>] = &[simple_spread::ENTRY, simple_tag::ENTRY];
+
+/// Most agents of a scenario: observations grow as the square of it.
+pub const MAX_AGENTS: usize = 1000;
 
 /// Builds a scenario from its checked parameters.
 pub type Build = fn(&Spec) -> Result<Box<dyn Scenario>, RegistryError>;
@@ -90,4 +98,67 @@ pub fn offsets(agents: &[AgentSpec], width: fn(&AgentSpec) -> usize) -> Vec<usiz
         offsets.push(offsets[offsets.len() - 1] + width(agent));
     }
     offsets
+}
+
+/// Checks what every particle scenario takes: profile, number of agents, steps, laws of motion.
+fn check_common(spec: &Spec, profile: &str, agents: usize, steps: usize, laws: &Laws) -> Result<(), RegistryError> {
+    match profile {
+        "paper" => {}
+        "mpe2" => return Err(spec.invalid("profile \"mpe2\" is not there yet: use \"paper\"")),
+        other => return Err(spec.invalid(format!("unknown profile {other:?}: use \"paper\""))),
+    }
+    if !(1..=MAX_AGENTS).contains(&agents) {
+        return Err(spec.invalid(format!("agents must be in [1, {MAX_AGENTS}], found {agents}")));
+    }
+    if !(1..=10_000).contains(&steps) {
+        return Err(spec.invalid(format!("steps must be in [1, 10000], found {steps}")));
+    }
+    spec.in_range("dt", laws.dt, 1e-4, 1.0)?;
+    spec.in_range("damping", laws.damping, 0.0, 1.0)?;
+    spec.in_range("contact_force", laws.contact_force, 0.0, 1e4)?;
+    spec.in_range("contact_margin", laws.contact_margin, 1e-9, 1.0)
+}
+
+/// Parameters as the manifest records them: the name, then every field.
+fn resolved(name: &str, parameters: &impl Serialize) -> Map<String, Value> {
+    let mut map = Map::new();
+    map.insert("name".to_owned(), Value::from(name));
+    if let Ok(Value::Object(fields)) = serde_json::to_value(parameters) {
+        map.extend(fields);
+    }
+    map
+}
+
+/// `x y vx vy` of the agents, then `x y` of `landmarks` landmarks.
+fn body_fields(agents: &[AgentSpec], landmarks: usize) -> Vec<String> {
+    let moving = agents.iter().flat_map(|a| ["x", "y", "vx", "vy"].map(|c| format!("{}.{c}", a.name)));
+    moving.chain((0..landmarks).flat_map(|l| ["x", "y"].map(|c| format!("landmark_{l}.{c}")))).collect()
+}
+
+/// Places bodies uniformly in the square of half width `half`, at rest.
+fn scatter(positions: &mut [[f64; 2]], half: f64, rng: &mut Stream) {
+    for p in positions {
+        *p = [crate::rng::uniform(rng, -half, half), crate::rng::uniform(rng, -half, half)];
+    }
+}
+
+/// Writes numbers one after the other into a flat observation buffer.
+struct Writer<'a> {
+    rest: &'a mut [f32],
+}
+
+impl Writer<'_> {
+    fn pair(&mut self, pair: [f64; 2]) {
+        let (head, tail) = std::mem::take(&mut self.rest).split_at_mut(2);
+        head.copy_from_slice(&[pair[0] as f32, pair[1] as f32]);
+        self.rest = tail;
+    }
+
+    /// The offset from `body` to `other`, or zeros beyond the squared radius.
+    fn seen(&mut self, world: &World, body: usize, other: usize, squared_radius: f64) -> bool {
+        let d = world.offset(body, other);
+        let seen = d[0] * d[0] + d[1] * d[1] <= squared_radius;
+        self.pair(if seen { d } else { [0.0; 2] });
+        seen
+    }
 }

@@ -1,1 +1,77 @@
-//! Training.
+//! Training: the loop that joins scenario, link, learner and Du-MIE; replay, checkpoints, observers, evaluation.
+
+mod checkpoint;
+pub mod config;
+pub mod dumie;
+mod evaluate;
+mod metrics;
+pub mod replay;
+mod run;
+mod tensorboard;
+
+use std::path::PathBuf;
+
+pub use config::TrainConfig;
+pub use evaluate::{EVALUATION_COLUMNS, EvaluationRow, evaluate, write_evaluation};
+pub use metrics::{METRIC_COLUMNS, MetricsRow};
+pub use run::{Options, Report, Trainer, train};
+
+/// What can go wrong with a training run.
+#[derive(Debug, thiserror::Error)]
+pub enum TrainError {
+    /// Files.
+    #[error(transparent)]
+    Io(#[from] crate::io::IoError),
+    /// Plugin names and parameters.
+    #[error(transparent)]
+    Registry(#[from] crate::registry::RegistryError),
+    /// Networks.
+    #[error(transparent)]
+    Nn(#[from] crate::nn::NnError),
+    /// A store.
+    #[error(transparent)]
+    Storage(#[from] crate::storage::StorageError),
+    /// Recording.
+    #[error(transparent)]
+    Record(#[from] crate::record::RecordError),
+    /// Tables.
+    #[error("could not write a table: {0}")]
+    Table(#[from] polars::error::PolarsError),
+    /// A configuration file that cannot be read.
+    #[error("configuration: {message}: {}", path.display())]
+    Config {
+        /// What is wrong, with line and column.
+        message: String,
+        /// Where.
+        path: PathBuf,
+    },
+    /// A value out of its range.
+    #[error("{name}: {message}")]
+    Value {
+        /// Its name in the configuration.
+        name: String,
+        /// What was expected and found.
+        message: String,
+    },
+    /// A store or episode that the trainer cannot use.
+    #[error("cannot train on this: {0}")]
+    Store(String),
+    /// Numbers stopped being numbers.
+    #[error("the run diverged at step {step}: {what} is no longer finite; lower the learning rates (the last good checkpoint was kept): {}", path.display())]
+    Diverged {
+        /// Environment step.
+        step: u64,
+        /// Which quantity.
+        what: String,
+        /// Run directory.
+        path: PathBuf,
+    },
+    /// A checkpoint that does not belong to this run.
+    #[error("cannot resume: {message}: {}", path.display())]
+    Resume {
+        /// What differs, and what to do.
+        message: String,
+        /// Where.
+        path: PathBuf,
+    },
+}

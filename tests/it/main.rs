@@ -2,3 +2,6 @@
 
 mod architecture;
 mod cli;
+mod links;
+mod record;
+mod worlds;

@@ -1,0 +1,287 @@
+//! The actors of a team: one network per learner, over its own observation and the messages it received.
+//!
+//! Input of actor i: `[o_i, ι^{1i} m^{1i}, …]` over the other learners in order; a lost message is zeros. The message
+//! is the sender's observation (Message-Dropout's convention).
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use candle_core::{DType, Device};
+use candle_nn::VarBuilder;
+
+use crate::nn::{Activation, Mlp, NnError, Tape, from_tensors, to_tensors};
+use crate::rng::Stream;
+use crate::schema::AgentSpec;
+
+/// Version of the actor file.
+const FILE_VERSION: &str = "1";
+
+/// What goes wrong with a trained policy on disk.
+#[derive(Debug, thiserror::Error)]
+pub enum RunPolicyError {
+    /// The file is not there, or cannot be read.
+    #[error("could not read the trained actors: {message}: {}", path.display())]
+    Unreadable {
+        /// What is wrong and what to do.
+        message: String,
+        /// Where.
+        path: PathBuf,
+    },
+    /// The actors were trained for agents of other shapes.
+    #[error("the run does not fit this scenario: {message}: {}", path.display())]
+    DoesNotFit {
+        /// What was expected and found.
+        message: String,
+        /// Where.
+        path: PathBuf,
+    },
+}
+
+/// One actor network per learner, all parameters in one flat vector.
+#[derive(Clone, Debug)]
+pub struct Actors {
+    /// Names of the learners, in order.
+    pub names: Vec<String>,
+    /// Width of each learner's observation (and so of its message).
+    pub observation: Vec<usize>,
+    /// Whether messages enter the networks at all.
+    pub messages: bool,
+    /// One network per learner.
+    pub networks: Vec<Mlp>,
+    /// Where each network starts in the flat parameters; the total is last.
+    pub offsets: Vec<usize>,
+}
+
+impl Actors {
+    /// Actors with two hidden ReLU layers and tanh outputs for these learners.
+    pub fn new(learners: &[&AgentSpec], hidden: &[usize], messages: bool) -> Self {
+        let observation: Vec<usize> = learners.iter().map(|a| a.observation).collect();
+        let all: usize = observation.iter().sum();
+        let networks: Vec<Mlp> = learners
+            .iter()
+            .map(|agent| {
+                let input = if messages { all } else { agent.observation };
+                let widths: Vec<usize> =
+                    std::iter::once(input).chain(hidden.iter().copied()).chain([agent.action]).collect();
+                Mlp::new(&widths, Activation::Relu, Activation::Tanh)
+            })
+            .collect();
+        let names = learners.iter().map(|a| a.name.clone()).collect();
+        Self::assemble(names, observation, messages, networks)
+    }
+
+    fn assemble(names: Vec<String>, observation: Vec<usize>, messages: bool, networks: Vec<Mlp>) -> Self {
+        let mut offsets = vec![0];
+        for network in &networks {
+            offsets.push(offsets[offsets.len() - 1] + network.parameters());
+        }
+        Self { names, observation, messages, networks, offsets }
+    }
+
+    /// Learners.
+    pub fn len(&self) -> usize {
+        self.networks.len()
+    }
+
+    /// Whether there is nobody.
+    pub fn is_empty(&self) -> bool {
+        self.networks.is_empty()
+    }
+
+    /// Parameters of all networks together.
+    pub fn parameters(&self) -> usize {
+        self.offsets[self.len()]
+    }
+
+    /// Fresh parameters of all networks.
+    pub fn init(&self, rng: &mut Stream) -> Vec<f32> {
+        let mut params = Vec::with_capacity(self.parameters());
+        for network in &self.networks {
+            network.init(rng, &mut params);
+        }
+        params
+    }
+
+    /// The slice of the flat parameters that belongs to actor `i`.
+    pub fn slice<'a>(&self, params: &'a [f32], i: usize) -> &'a [f32] {
+        &params[self.offsets[i]..self.offsets[i + 1]]
+    }
+
+    /// Where the observation of learner `j` starts in a row of all observations.
+    pub fn observation_offset(&self, j: usize) -> usize {
+        self.observation[..j].iter().sum()
+    }
+
+    /// Appends the input of actor `i` for one row: `observations` `[Σ observation]` of all learners, `link` the bits
+    /// `[sender][receiver]` of that row.
+    pub fn push_input(&self, i: usize, observations: &[f32], link: &[bool], out: &mut Vec<f32>) {
+        let own = self.observation_offset(i);
+        out.extend_from_slice(&observations[own..own + self.observation[i]]);
+        if !self.messages {
+            return;
+        }
+        let mut at = 0;
+        for (j, &width) in self.observation.iter().enumerate() {
+            if j != i {
+                if link[j * self.len() + i] {
+                    out.extend_from_slice(&observations[at..at + width]);
+                } else {
+                    out.resize(out.len() + width, 0.0);
+                }
+            }
+            at += width;
+        }
+    }
+
+    /// Actions of actor `i` for `rows` inputs, `[rows, action]`, each in (−1, 1); they stay in the tape.
+    pub fn act<'t>(&self, params: &[f32], i: usize, input: &[f32], rows: usize, tape: &'t mut Tape) -> &'t [f32] {
+        self.networks[i].forward(self.slice(params, i), input, rows, tape)
+    }
+
+    /// Writes the actors as safetensors: `actor.<name>.<layer>.weight` `[outputs, inputs]`, `….bias`, and what a
+    /// reader must know as metadata.
+    ///
+    /// # Errors
+    /// [`NnError`].
+    pub fn to_bytes(&self, params: &[f32]) -> Result<Vec<u8>, NnError> {
+        let mut tensors = BTreeMap::new();
+        for (i, network) in self.networks.iter().enumerate() {
+            to_tensors(&format!("actor.{}", self.names[i]), network, self.slice(params, i), &mut tensors)?;
+        }
+        let join = |v: Vec<String>| v.join(",");
+        let metadata = [
+            ("ccmarl.actors".to_owned(), FILE_VERSION.to_owned()),
+            ("hidden_activation".to_owned(), "relu".to_owned()),
+            ("output_activation".to_owned(), "tanh".to_owned()),
+            ("learners".to_owned(), join(self.names.clone())),
+            ("observation".to_owned(), join(self.observation.iter().map(ToString::to_string).collect())),
+            ("messages".to_owned(), if self.messages { "observation" } else { "off" }.to_owned()),
+        ];
+        Ok(safetensors::serialize(tensors, Some(metadata.into_iter().collect()))?)
+    }
+
+    /// Reads the actors of a run directory (or an actor file) and their parameters.
+    ///
+    /// # Errors
+    /// [`RunPolicyError::Unreadable`].
+    pub fn load(path: &Path) -> Result<(Self, Vec<f32>), RunPolicyError> {
+        let file = if path.is_dir() { path.join("checkpoint").join("actors.safetensors") } else { path.to_owned() };
+        let fail = |message: String| RunPolicyError::Unreadable { message, path: file.clone() };
+        let bytes = std::fs::read(&file)
+            .map_err(|e| fail(format!("{e} (give the directory that `ccmarl train --out` wrote)")))?;
+        Self::from_bytes(bytes).map_err(fail)
+    }
+
+    fn from_bytes(bytes: Vec<u8>) -> Result<(Self, Vec<f32>), String> {
+        let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).map_err(|e| e.to_string())?;
+        let metadata = header.metadata().clone().unwrap_or_default();
+        let key = |k: &str| metadata.get(k).ok_or_else(|| format!("the metadata key {k:?} is missing"));
+        if key("ccmarl.actors")? != FILE_VERSION {
+            return Err(format!("actor file version {:?} is not {FILE_VERSION:?}", metadata.get("ccmarl.actors")));
+        }
+        let names: Vec<String> = key("learners")?.split(',').map(ToOwned::to_owned).collect();
+        let observation: Vec<usize> = key("observation")?.split(',').filter_map(|w| w.parse().ok()).collect();
+        let messages = key("messages")? == "observation";
+        if names.len() != observation.len() {
+            return Err("as many observation widths as learners are needed".to_owned());
+        }
+        let mut networks = Vec::new();
+        for name in &names {
+            let mut widths = Vec::new();
+            while let Some(info) = header.info(&format!("actor.{name}.{}.weight", widths.len().saturating_sub(1))) {
+                let [outputs, inputs] = info.shape[..] else { return Err("a weight must have two axes".to_owned()) };
+                if outputs == 0 || inputs == 0 {
+                    return Err("a weight has an empty axis".to_owned());
+                }
+                if widths.is_empty() {
+                    widths.push(inputs);
+                }
+                widths.push(outputs);
+            }
+            if widths.len() < 2 {
+                return Err(format!("the network of {name:?} is missing"));
+            }
+            networks.push(Mlp::new(&widths, Activation::Relu, Activation::Tanh));
+        }
+        let builder = VarBuilder::from_buffered_safetensors(bytes, DType::F32, &Device::Cpu)
+            .map_err(|e| e.to_string())?;
+        let mut params = Vec::new();
+        for (name, network) in names.iter().zip(&networks) {
+            from_tensors(&builder, &format!("actor.{name}"), network, &mut params).map_err(|e| e.to_string())?;
+        }
+        Ok((Self::assemble(names, observation, messages, networks), params))
+    }
+
+    /// Checks that these actors fit the learners of a scenario.
+    ///
+    /// # Errors
+    /// [`RunPolicyError::DoesNotFit`] that names the first difference.
+    pub fn check_fit(&self, learners: &[&AgentSpec], path: &Path) -> Result<(), RunPolicyError> {
+        let fail = |message: String| Err(RunPolicyError::DoesNotFit { message, path: path.to_owned() });
+        if learners.len() != self.len() {
+            return fail(format!("trained for {} learners, the scenario has {}", self.len(), learners.len()));
+        }
+        let all: usize = self.observation.iter().sum();
+        for (i, agent) in learners.iter().enumerate() {
+            let expected = [agent.observation, agent.action];
+            let found = [self.observation[i], self.networks[i].outputs()];
+            if expected != found || self.networks[i].inputs() != if self.messages { all } else { found[0] } {
+                return fail(format!(
+                    "{} has observation and action widths {expected:?}, the trained actor {found:?}",
+                    agent.name
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rng::Seeds;
+    use crate::schema::Controller;
+
+    fn agent(name: &str, observation: usize) -> AgentSpec {
+        AgentSpec {
+            name: name.to_owned(),
+            team: "team".to_owned(),
+            controller: Controller::Policy,
+            learner: true,
+            communicator: true,
+            observation,
+            message: observation,
+            action: 2,
+        }
+    }
+
+    #[test]
+    fn a_lost_message_enters_as_zeros_and_the_own_observation_comes_first() {
+        let agents = [agent("a", 2), agent("b", 1), agent("c", 2)];
+        let actors = Actors::new(&agents.iter().collect::<Vec<_>>(), &[4], true);
+        let mut link = [true; 9];
+        link[3] = false; // b -> a is lost
+        let mut input = Vec::new();
+        actors.push_input(0, &[1.0, 2.0, 3.0, 4.0, 5.0], &link, &mut input);
+        actors.push_input(1, &[1.0, 2.0, 3.0, 4.0, 5.0], &link, &mut input);
+        assert_eq!(input, [1.0, 2.0, 0.0, 4.0, 5.0, 3.0, 1.0, 2.0, 4.0, 5.0]);
+    }
+
+    #[test]
+    fn actors_survive_their_file_and_damage_is_an_error() {
+        let agents = [agent("a", 3), agent("b", 4)];
+        let agents: Vec<&AgentSpec> = agents.iter().collect();
+        let actors = Actors::new(&agents, &[8, 8], true);
+        let params = actors.init(&mut Seeds::new(1).stream("actors"));
+        let bytes = actors.to_bytes(&params).unwrap();
+        assert_eq!(bytes, actors.to_bytes(&params).unwrap());
+        let (read, again) = Actors::from_bytes(bytes.clone()).unwrap();
+        assert_eq!((again, read.networks), (params, actors.networks.clone()));
+        for cut in [0, 7, 8, 100, bytes.len() - 1] {
+            assert!(Actors::from_bytes(bytes[..cut].to_vec()).is_err());
+        }
+        let other = [agent("a", 3), agent("b", 5)];
+        let error = actors.check_fit(&other.iter().collect::<Vec<_>>(), Path::new("runs/x")).unwrap_err().to_string();
+        assert!(error.contains("b has observation and action widths [5, 2]"), "{error}");
+    }
+}

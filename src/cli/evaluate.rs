@@ -1,0 +1,88 @@
+//! `ccmarl evaluate`: a trained team on every channel of a suite.
+
+use std::path::PathBuf;
+
+use serde_json::json;
+
+use super::{Outcome, ui};
+use crate::Error;
+use crate::io::IoError;
+use crate::link::suite;
+use crate::registry::Spec;
+use crate::scenario;
+use crate::train::{TrainConfig, TrainError, evaluate, write_evaluation};
+
+const EXAMPLES: &str = "\
+Examples:
+  ccmarl evaluate runs/x --suite paper --episodes 100
+  ccmarl evaluate runs/x --episodes 1000 --format json
+
+Actions carry no exploration noise. Every policy of one seed meets the same episodes. Writes evaluation.parquet (one row
+per test episode) into the run directory; an older one is replaced.";
+
+/// Arguments of `evaluate`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(super) struct Args {
+    /// Run directory that `ccmarl train` wrote
+    run: PathBuf,
+    /// Test channels
+    #[arg(long, default_value = "paper")]
+    suite: String,
+    /// Test episodes per channel
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
+    episodes: u64,
+    /// How results are printed
+    #[arg(long, value_enum, default_value_t)]
+    format: ui::Format,
+}
+
+/// Runs the command.
+pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    let file = args.run.join("config.toml");
+    if !file.exists() {
+        return Err(Error::from(IoError::Missing(file)).into());
+    }
+    let config = TrainConfig::read(&file).and_then(TrainConfig::resolve).map_err(Error::from)?;
+    let channels = suite(&args.suite).map_err(Error::from)?;
+    let policy = Spec::new("run").with("path", args.run.to_string_lossy());
+    let bar = ui::progress(channels.len() as u64, "channels");
+    let rows = evaluate(&config, &policy, &channels, args.episodes, &mut |_| bar.inc(1)).map_err(Error::from)?;
+    bar.finish_and_clear();
+    write_evaluation(&args.run, &config, &rows).map_err(Error::from)?;
+
+    let mut summary = Vec::new();
+    for channel in &channels {
+        let rows: Vec<_> = rows.iter().filter(|r| r.channel == channel.id).collect();
+        let n = rows.len() as f64;
+        let mean = rows.iter().map(|r| r.episode_return).sum::<f64>() / n;
+        let squares = rows.iter().map(|r| (r.episode_return - mean).powi(2)).sum::<f64>();
+        let std = (squares / (n - 1.0).max(1.0)).sqrt();
+        let loss = rows.iter().map(|r| r.loss_rate).sum::<f64>() / n;
+        summary.push((channel.id, mean, std, loss, rows.len()));
+    }
+    match args.format {
+        ui::Format::Json => {
+            let channels: Vec<_> = summary
+                .iter()
+                .map(|(id, mean, std, loss, n)| {
+                    json!({"channel": id, "return_mean": mean, "return_std": std, "loss_rate": loss, "episodes": n})
+                })
+                .collect();
+            ui::print_json(&json!({"run": args.run.display().to_string(), "algorithm": config.algorithm,
+                "scenario": config.scenario, "seed": config.seed, "channels": channels}))?;
+        }
+        ui::Format::Table => {
+            let rows: Vec<Vec<String>> = summary
+                .iter()
+                .map(|(id, mean, std, loss, n)| {
+                    vec![(*id).to_owned(), format!("{mean:.1}"), format!("{std:.1}"), format!("{:.1} %", 100.0 * loss), n.to_string()]
+                })
+                .collect();
+            ui::print_table(&["channel", "return", "± over episodes", "messages lost", "episodes"], &rows)?;
+            let scenario = scenario::build(&config.scenario).map_err(TrainError::from).map_err(Error::from)?;
+            ui::say(&format!("return: {}", scenario.reward_convention()));
+        }
+    }
+    Ok(Outcome::Done)
+}

@@ -1,0 +1,211 @@
+//! Episodes: each a pure function of the seed and its number; computed in parallel, stored in order.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::sync_channel;
+
+use rayon::iter::{IntoParallelIterator as _, ParallelIterator as _};
+
+use super::{Policy, RecordError, View};
+use crate::link::Link;
+use crate::rng::Seeds;
+use crate::scenario::Scenario;
+use crate::schema::{Episode, Layout, Manifest};
+use crate::storage::EpisodeSink;
+
+/// What is recorded.
+#[derive(Clone, Copy)]
+pub struct Recording<'a> {
+    /// The task.
+    pub scenario: &'a dyn Scenario,
+    /// Which messages arrive.
+    pub link: &'a dyn Link,
+    /// Who sends and acts.
+    pub policy: &'a dyn Policy,
+    /// The user's seed.
+    pub seed: u64,
+    /// How many episodes.
+    pub episodes: u64,
+}
+
+/// How it is computed; changes nothing in the result.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Options {
+    /// Threads; 0 is one per core.
+    pub threads: usize,
+    /// Episodes computed at once; 0 chooses by their size. At most three blocks are in memory.
+    pub block: usize,
+}
+
+/// How a recording ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Recorded {
+    /// Episodes the sink has taken: 0 to this number, without gaps.
+    pub episodes: u64,
+    /// Whether it was stopped before the end.
+    pub interrupted: bool,
+}
+
+/// The figures of one episode.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct EpisodeReturn {
+    /// Sum of the team reward.
+    pub episode_return: f64,
+    /// Lost share of the off-diagonal link bits over the steps with `is_last = false`; 0 where there are no links.
+    pub loss_rate: f64,
+}
+
+/// Memory that a block may take, bytes; a block holds at least one episode.
+const BLOCK_BYTES: usize = 32 << 20;
+
+impl Recording<'_> {
+    /// The shape of its episodes: the scenario's, with the policy's message widths.
+    pub fn layout(&self) -> Layout {
+        let mut layout = self.scenario.layout();
+        for (i, agent) in layout.agents.iter_mut().enumerate() {
+            agent.message = if agent.communicator { self.policy.message_width(self.scenario, i) } else { 0 };
+        }
+        layout
+    }
+
+    /// The unsealed manifest of a store of these episodes.
+    pub fn manifest(&self) -> Manifest {
+        let [scenario, link, policy] =
+            [self.scenario.parameters(), self.link.parameters(), self.policy.parameters()].map(Into::into);
+        Manifest::new(self.seed, scenario, link, policy, &self.layout())
+    }
+
+    /// Episode number `index`: the same for the same seed, whoever asks and in whatever order.
+    pub fn episode(&self, index: u64) -> Episode {
+        self.episode_of(&self.layout(), index)
+    }
+
+    fn episode_of(&self, layout: &Layout, index: u64) -> Episode {
+        let (scenario, agents, steps) = (self.scenario, &layout.agents, self.scenario.steps());
+        let seeds = Seeds::new(self.seed).child("record").indexed("episode", index);
+        let total = |width: fn(&crate::schema::AgentSpec) -> usize| agents.iter().map(width).sum();
+        let mut observations = vec![0.0; total(|a| a.observation)];
+        let mut messages = vec![0.0; total(|a| a.message)];
+        let mut actions = vec![0.0; total(|a| a.action)];
+        let mut rewards = vec![0.0; agents.len()];
+        let communicators = layout.communicators();
+        let mut link = vec![true; communicators.len() * communicators.len()];
+        let mut positions = vec![[0.0; 2]; communicators.len()];
+
+        let mut world = scenario.world();
+        scenario.reset(&mut world, &mut seeds.stream("world"));
+        let mut rule = seeds.stream("scripted");
+        let mut links = self.link.start(communicators.len(), &seeds.child("link"));
+        let mut policy = self.policy.start(scenario, &seeds.child("policy"));
+        let mut episode = Episode::with_capacity(layout, index, steps);
+        for t in 0..=steps {
+            scenario.observe(&world, &mut observations);
+            policy.send(&observations, &mut messages);
+            for (position, &agent) in positions.iter_mut().zip(&communicators) {
+                *position = world.positions[agent];
+            }
+            links.emit(&positions, &mut link);
+            scenario.state(&world, &mut episode.state);
+            append(&mut episode.observations, &observations);
+            append(&mut episode.messages, &messages);
+            episode.link.extend_from_slice(&link);
+            if t == steps {
+                break; // the last row has no action
+            }
+            let view = View { world: &world, observations: &observations, messages: &messages, link: &link };
+            policy.act(&view, &mut actions);
+            scenario.scripted(&world, &mut rule, &mut actions);
+            let reward = scenario.step(&mut world, &actions, &mut rewards);
+            append(&mut episode.actions, &actions);
+            episode.reward.push(reward);
+            episode.rewards.iter_mut().zip(&rewards).for_each(|(column, &r)| column.push(r));
+        }
+        episode.steps = steps;
+        episode
+    }
+
+    /// Computes all episodes in blocks, in parallel, and appends them in order. The sink is called from this thread
+    /// while the next block is computed. `committed` is told of every episode that the sink has taken; when `stop`
+    /// turns true the recording ends after the episode at hand.
+    ///
+    /// # Errors
+    /// [`RecordError::NoEpisodes`], [`RecordError::Storage`] when the sink refuses, [`RecordError::Threads`].
+    pub fn record(
+        &self,
+        sink: &mut dyn EpisodeSink,
+        options: Options,
+        committed: &mut dyn FnMut(&Episode),
+        stop: &AtomicBool,
+    ) -> Result<Recorded, RecordError> {
+        if self.episodes == 0 {
+            return Err(RecordError::NoEpisodes);
+        }
+        let threads = options.threads;
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .map_err(|e| RecordError::Threads { threads, reason: e.to_string() })?;
+        let layout = self.layout();
+        let block = if options.block == 0 { default_block(&layout, self.scenario.steps()) } else { options.block };
+        let mut done = 0;
+        std::thread::scope(|scope| {
+            let (send, receive) = sync_channel::<Vec<Episode>>(1);
+            let (layout, pool) = (&layout, &pool);
+            scope.spawn(move || {
+                let mut next = 0;
+                while next < self.episodes && !stop.load(Ordering::Relaxed) {
+                    let end = self.episodes.min(next.saturating_add(block as u64));
+                    let compute = || (next..end).into_par_iter().map(|i| self.episode_of(layout, i)).collect();
+                    if send.send(pool.install(compute)).is_err() {
+                        return; // the sink has failed
+                    }
+                    next = end;
+                }
+            });
+            for episode in receive.iter().flatten() {
+                if stop.load(Ordering::Relaxed) {
+                    break;
+                }
+                sink.append(&episode)?;
+                done += 1;
+                committed(&episode);
+            }
+            Ok(Recorded { episodes: done, interrupted: done < self.episodes })
+        })
+    }
+}
+
+/// Splits a flat row among the agents' columns.
+fn append(columns: &mut [crate::schema::Matrix], row: &[f32]) {
+    let mut rest = row;
+    for column in columns {
+        let (own, others) = rest.split_at(column.width);
+        column.data.extend_from_slice(own);
+        rest = others;
+    }
+}
+
+/// Episodes in a block: what fits in [`BLOCK_BYTES`], at most 256.
+fn default_block(layout: &Layout, steps: usize) -> usize {
+    let floats: usize = layout.agents.iter().map(|a| a.observation + a.message + a.action + 1).sum();
+    let row = 4 * floats + 8 * layout.state_fields.len() + layout.communicators().len().pow(2);
+    (BLOCK_BYTES / ((steps + 1) * row).max(1)).clamp(1, 256)
+}
+
+/// Lost share of the off-diagonal link bits of the steps with `is_last = false`, among `n` communicators; 0 if n < 2.
+pub fn loss_rate(episode: &Episode, n: usize) -> f64 {
+    let bits = &episode.link[..episode.steps * n * n];
+    let links = episode.steps * n * n.saturating_sub(1);
+    let lost = bits.iter().filter(|&&delivered| !delivered).count();
+    if links == 0 { 0.0 } else { lost as f64 / links as f64 }
+}
+
+/// Returns and realised loss of `count` episodes from number `first` on, in order; parallel, nothing is stored.
+pub fn returns(recording: &Recording<'_>, first: u64, count: u64) -> Vec<EpisodeReturn> {
+    let layout = recording.layout();
+    let n = layout.communicators().len();
+    let one = |index| {
+        let episode = recording.episode_of(&layout, index);
+        EpisodeReturn { episode_return: episode.episode_return(), loss_rate: loss_rate(&episode, n) }
+    };
+    (first..first.saturating_add(count)).into_par_iter().map(one).collect()
+}

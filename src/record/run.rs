@@ -1,0 +1,181 @@
+//! # What it is
+//! A trained team: the actors of a run directory, with or without exploration noise.
+//!
+//! # Definition
+//! a^i = clamp(π^i(o^i, {ι^{ji} o^j}) + noise, −1, 1); noise is none, Gaussian with standard deviation σ, or the
+//! Ornstein–Uhlenbeck process x ← x − θ x + σ z of the training loop, times its scale.
+//!
+//! # Shapes and units
+//! One action row per learner, in \[−1, 1\]; the message is the sender's observation.
+//!
+//! # Parameters
+//! `path` (the run directory), `action_noise` (σ, default 0).
+//!
+//! # When it fails
+//! The directory holds no actors, or they were trained for other agents.
+//!
+//! # Reference
+//! Paper, appendix "Parameters Setting"; the noise process is that of the paper's parent code.
+//!
+//! # Differences from the reference implementation
+//! One noise process per component instead of one object shared by all agents and advanced once per agent.
+
+use std::path::PathBuf;
+
+use serde::Deserialize;
+use serde_json::{Map, Value};
+
+use super::{Build, Policy, PolicyEpisode, View};
+use crate::algo::Actors;
+use crate::nn::Tape;
+use crate::registry::{Entry, RegistryError, Spec};
+use crate::rng::{self, Seeds, Stream};
+use crate::scenario::{Scenario, offsets};
+use crate::schema::AgentSpec;
+
+pub(super) const ENTRY: Entry<Build> = Entry {
+    name: "run",
+    summary: "a trained team: run:DIR, the directory that `ccmarl train --out` wrote",
+    reference: "Lowe et al. 2017; arXiv 2512.03528, Algorithm 1",
+    value: Some("path"),
+    build: |spec, scenario| {
+        #[derive(Deserialize)]
+        #[serde(deny_unknown_fields)]
+        struct Params {
+            path: PathBuf,
+            #[serde(default)]
+            action_noise: f64,
+        }
+        let params: Params = spec.params()?;
+        if !(0.0..=10.0).contains(&params.action_noise) {
+            return Err(spec.invalid(format!("action_noise: expected 0 to 10, found {}", params.action_noise)));
+        }
+        let (actors, values) = Actors::load(&params.path).map_err(|e| spec.invalid(e.to_string()))?;
+        actors.check_fit(&learners(scenario), &params.path).map_err(|e| spec.invalid(e.to_string()))?;
+        let noise =
+            if params.action_noise > 0.0 { ActionNoise::Gaussian(params.action_noise) } else { ActionNoise::None };
+        Ok(Box::new(Trained { actors, params: values, noise, parameters: described(spec) }))
+    },
+};
+
+/// What the manifest records: the run's name, never an absolute path of this machine.
+fn described(spec: &Spec) -> Map<String, Value> {
+    let mut parameters = Map::from_iter([("name".to_owned(), Value::from(spec.name.clone()))]);
+    parameters.extend(spec.params.clone());
+    parameters
+}
+
+fn learners(scenario: &dyn Scenario) -> Vec<&AgentSpec> {
+    scenario.agents().iter().filter(|a| a.learner).collect()
+}
+
+/// Exploration noise on actions.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum ActionNoise {
+    /// None: the policy as it is.
+    None,
+    /// Independent normal draws with this standard deviation.
+    Gaussian(f64),
+    /// x ← x − theta x + sigma z per step, reset each episode, times `scale`.
+    OrnsteinUhlenbeck {
+        /// Pull towards zero.
+        theta: f64,
+        /// Standard deviation of a step.
+        sigma: f64,
+        /// Factor on the process.
+        scale: f64,
+    },
+}
+
+/// A team of actors with their parameters.
+#[derive(Clone, Debug)]
+pub struct Trained {
+    /// Shapes.
+    pub actors: Actors,
+    /// All actors' parameters, flat.
+    pub params: Vec<f32>,
+    /// Exploration.
+    pub noise: ActionNoise,
+    /// What the manifest records.
+    pub parameters: Map<String, Value>,
+}
+
+impl Policy for Trained {
+    fn parameters(&self) -> Map<String, Value> {
+        self.parameters.clone()
+    }
+
+    fn start<'a>(&'a self, scenario: &'a dyn Scenario, seeds: &Seeds) -> Box<dyn PolicyEpisode + 'a> {
+        let agents = scenario.agents();
+        let observation_offsets = offsets(agents, |a| a.observation);
+        let action_offsets = offsets(agents, |a| a.action);
+        let learners: Vec<usize> = (0..agents.len()).filter(|&a| agents[a].learner).collect();
+        Box::new(Acting {
+            team: self,
+            noise: seeds.stream("action-noise"),
+            process: vec![0.0; learners.iter().map(|&a| agents[a].action).sum()],
+            observation: learners.iter().map(|&a| [observation_offsets[a], observation_offsets[a + 1]]).collect(),
+            action: learners.iter().map(|&a| [action_offsets[a], action_offsets[a + 1]]).collect(),
+            sends: senders(agents),
+            row: Vec::new(),
+            input: Vec::new(),
+            tape: Tape::default(),
+        })
+    }
+}
+
+/// Observation range of every agent that sends, in order.
+fn senders(agents: &[AgentSpec]) -> Vec<[usize; 2]> {
+    let at = offsets(agents, |a| a.observation);
+    (0..agents.len()).filter(|&a| agents[a].message > 0).map(|a| [at[a], at[a + 1]]).collect()
+}
+
+struct Acting<'a> {
+    team: &'a Trained,
+    noise: Stream,
+    process: Vec<f64>,
+    observation: Vec<[usize; 2]>,
+    action: Vec<[usize; 2]>,
+    sends: Vec<[usize; 2]>,
+    row: Vec<f32>,
+    input: Vec<f32>,
+    tape: Tape,
+}
+
+impl PolicyEpisode for Acting<'_> {
+    fn send(&mut self, observations: &[f32], messages: &mut [f32]) {
+        let mut at = 0;
+        for &[from, to] in &self.sends {
+            messages[at..at + to - from].copy_from_slice(&observations[from..to]);
+            at += to - from;
+        }
+    }
+
+    fn act(&mut self, view: &View<'_>, actions: &mut [f32]) {
+        self.row.clear();
+        for &[from, to] in &self.observation {
+            self.row.extend_from_slice(&view.observations[from..to]);
+        }
+        let mut component = 0;
+        for (i, &[from, to]) in self.action.iter().enumerate() {
+            self.input.clear();
+            self.team.actors.push_input(i, &self.row, view.link, &mut self.input);
+            let action = self.team.actors.act(&self.team.params, i, &self.input, 1, &mut self.tape);
+            actions[from..to].copy_from_slice(action);
+            for action in &mut actions[from..to] {
+                let noise = match self.team.noise {
+                    ActionNoise::None => continue,
+                    ActionNoise::Gaussian(sigma) => sigma * rng::normal(&mut self.noise),
+                    ActionNoise::OrnsteinUhlenbeck { scale, .. } if scale == 0.0 => continue,
+                    ActionNoise::OrnsteinUhlenbeck { theta, sigma, scale } => {
+                        let x = &mut self.process[component];
+                        *x += sigma * rng::normal(&mut self.noise) - theta * *x;
+                        component += 1;
+                        scale * *x
+                    }
+                };
+                *action = (*action + noise as f32).clamp(-1.0, 1.0);
+            }
+        }
+    }
+}

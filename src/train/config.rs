@@ -1,0 +1,275 @@
+//! A training run's configuration: the TOML a user writes, checked and with every default filled in.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::TrainError;
+use crate::algo::{self, MaddpgConfig};
+use crate::registry::Spec;
+
+/// Largest configuration file that is read, bytes.
+const LIMIT: u64 = 1 << 20;
+
+/// Everything a training run depends on. `config.toml` in the run directory is this, fully resolved.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainConfig {
+    /// Program version that resolved it.
+    #[serde(default)]
+    pub ccmarl: String,
+    /// Root of the seed tree.
+    #[serde(default = "one")]
+    pub seed: u64,
+    /// Environment steps in all.
+    #[serde(default = "four_million")]
+    pub steps: u64,
+    /// Preset, an id of the published tables.
+    pub algorithm: String,
+    /// Transitions kept in replay.
+    #[serde(default = "hundred_thousand")]
+    pub replay: usize,
+    /// No update before this many steps.
+    #[serde(default = "first_update")]
+    pub warmup: u64,
+    /// One update per this many environment steps.
+    #[serde(default = "hundred")]
+    pub update_every: u64,
+    /// One row of metrics per this many updates.
+    #[serde(default = "hundred")]
+    pub log_every: u64,
+    /// The scenario and its parameters.
+    pub scenario: Spec,
+    /// Link prior in training; the preset's when absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub prior: Option<Spec>,
+    /// The learner.
+    #[serde(default)]
+    pub maddpg: MaddpgConfig,
+    /// Exploration noise.
+    #[serde(default)]
+    pub noise: NoiseConfig,
+    /// The dual mutual-information estimator; α and β of the preset and scenario when absent.
+    #[serde(default)]
+    pub dumie: DumieConfig,
+}
+
+fn one() -> u64 {
+    1
+}
+fn hundred() -> u64 {
+    100
+}
+fn first_update() -> u64 {
+    1024
+}
+fn four_million() -> u64 {
+    4_000_000
+}
+fn hundred_thousand() -> usize {
+    100_000
+}
+
+/// Ornstein–Uhlenbeck exploration noise, added to the tanh output and clamped to [−1, 1].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct NoiseConfig {
+    /// Pull towards zero per step.
+    pub theta: f64,
+    /// Standard deviation of a step.
+    pub sigma: f64,
+    /// Scale in the first episode.
+    pub scale: f64,
+    /// Episodes over which the scale falls linearly to zero.
+    pub episodes: u64,
+}
+
+impl Default for NoiseConfig {
+    fn default() -> Self {
+        Self { theta: 0.15, sigma: 0.2, scale: 0.3, episodes: 25_000 }
+    }
+}
+
+/// The Du-MIE: what is estimated, and how it shapes the reward.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DumieConfig {
+    /// Weight of the JSD value on delivered messages.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub alpha: Option<f64>,
+    /// Weight of the CLUB value on lost messages.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub beta: Option<f64>,
+    /// Adam's learning rate for both estimators.
+    pub learning_rate: f32,
+    /// Pairs in each ring.
+    pub ring: usize,
+    /// Pairs per estimator step, drawn with replacement.
+    pub batch: usize,
+    /// An estimator learns and shapes once its ring holds this many pairs.
+    pub start: usize,
+    /// Estimator steps per update (k of Algorithm 1).
+    pub k: usize,
+    /// Derangements of the action per message.
+    pub negatives: usize,
+    /// Where the shaping is computed.
+    pub shaping: Shaping,
+    /// What CLUB sees of a lost message.
+    pub lost_message: LostMessage,
+    /// Whether the JSD value is shifted by 2 ln 2 (design: shifted; the paper prints it unshifted).
+    pub jsd_shift: bool,
+}
+
+/// Where the shaping is computed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Shaping {
+    /// On every minibatch, with the current estimators.
+    Minibatch,
+    /// Once, when the episode ends, and stored (Algorithm 1 to the letter).
+    AtRollout,
+}
+
+/// What CLUB sees of a lost message.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum LostMessage {
+    /// The message that was sent (Eq. 4 of the paper).
+    Sent,
+    /// The zero vector that was received.
+    Zero,
+}
+
+impl Default for DumieConfig {
+    fn default() -> Self {
+        Self {
+            alpha: None,
+            beta: None,
+            learning_rate: 1e-4,
+            ring: 1000,
+            batch: 1024,
+            start: 500,
+            k: 1,
+            negatives: 16,
+            shaping: Shaping::Minibatch,
+            lost_message: LostMessage::Sent,
+            jsd_shift: true,
+        }
+    }
+}
+
+impl TrainConfig {
+    /// A run of `algorithm` on `scenario` with every default.
+    pub fn new(scenario: Spec, algorithm: &str) -> Self {
+        Self {
+            ccmarl: String::new(),
+            seed: one(),
+            steps: four_million(),
+            algorithm: algorithm.to_owned(),
+            replay: hundred_thousand(),
+            warmup: first_update(),
+            update_every: hundred(),
+            log_every: hundred(),
+            scenario,
+            prior: None,
+            maddpg: MaddpgConfig::default(),
+            noise: NoiseConfig::default(),
+            dumie: DumieConfig::default(),
+        }
+    }
+
+    /// Reads a TOML file; a typo is refused with its line.
+    ///
+    /// # Errors
+    /// [`TrainError::Io`], [`TrainError::Config`].
+    pub fn read(path: &Path) -> Result<Self, TrainError> {
+        let text = crate::io::read_text(path, LIMIT)?;
+        toml::from_str(&text).map_err(|e| TrainError::Config { message: e.to_string().trim().replace('\n', "; "), path: path.to_owned() })
+    }
+
+    /// Fills in what preset and scenario decide, and checks every range.
+    ///
+    /// # Errors
+    /// [`TrainError::Registry`] for unknown names, [`TrainError::Value`] for a value out of its range.
+    pub fn resolve(mut self) -> Result<Self, TrainError> {
+        let preset = algo::preset(&self.algorithm)?;
+        env!("CARGO_PKG_VERSION").clone_into(&mut self.ccmarl);
+        self.scenario = resolved(crate::scenario::build(&self.scenario)?.parameters());
+        let prior = self.prior.take().unwrap_or(preset.prior);
+        let setting = crate::link::Setting { distance_unit: crate::scenario::build(&self.scenario)?.link_unit() };
+        self.prior = Some(resolved(crate::link::build(&prior, &setting)?.parameters()));
+        let tag = self.scenario.name == "simple_tag";
+        let [alpha, beta] = if preset.shaped { [0.01, if tag { 0.001 } else { 0.01 }] } else { [0.0, 0.0] };
+        self.dumie.alpha.get_or_insert(alpha);
+        self.dumie.beta.get_or_insert(beta);
+        self.check()?;
+        Ok(self)
+    }
+
+    /// α and β; zero before [`TrainConfig::resolve`] where not given.
+    pub fn weights(&self) -> [f64; 2] {
+        [self.dumie.alpha.unwrap_or(0.0), self.dumie.beta.unwrap_or(0.0)]
+    }
+
+    fn check(&self) -> Result<(), TrainError> {
+        let (m, d, n) = (&self.maddpg, &self.dumie, &self.noise);
+        let positive = |name: &'static str, value: usize| (name, value > 0, format!("expected at least 1, found {value}"));
+        let unit = |name: &'static str, value: f32| {
+            (name, (0.0..=1.0).contains(&value), format!("expected a value in [0, 1], found {value}"))
+        };
+        let rate = |name: &'static str, value: f32| {
+            (name, value > 0.0 && value.is_finite(), format!("expected a positive number, found {value}"))
+        };
+        let weight = |name: &'static str, value: f64| {
+            (name, value >= 0.0 && value.is_finite(), format!("expected a number ≥ 0, found {value}"))
+        };
+        let [alpha, beta] = self.weights();
+        let rules = [
+            positive("steps", self.steps as usize),
+            positive("replay", self.replay),
+            positive("update_every", self.update_every as usize),
+            positive("log_every", self.log_every as usize),
+            positive("maddpg.batch", m.batch),
+            positive("maddpg.hidden", m.hidden.iter().copied().min().unwrap_or(0)),
+            unit("maddpg.gamma", m.gamma),
+            unit("maddpg.tau", m.tau),
+            rate("maddpg.actor_learning_rate", m.actor_learning_rate),
+            rate("maddpg.critic_learning_rate", m.critic_learning_rate),
+            rate("maddpg.grad_clip", m.grad_clip),
+            weight("maddpg.action_penalty", f64::from(m.action_penalty)),
+            weight("noise.theta", n.theta),
+            weight("noise.sigma", n.sigma),
+            weight("noise.scale", n.scale),
+            weight("dumie.alpha", alpha),
+            weight("dumie.beta", beta),
+            rate("dumie.learning_rate", d.learning_rate),
+            positive("dumie.ring", d.ring),
+            positive("dumie.negatives", d.negatives),
+            positive("dumie.k", d.k),
+            ("dumie.batch", d.batch > 1, format!("expected at least 2, found {}", d.batch)),
+            ("dumie.start", (2..=d.ring).contains(&d.start), format!("expected 2 to ring ({}), found {}", d.ring, d.start)),
+        ];
+        match rules.into_iter().find(|(_, ok, _)| !ok) {
+            None => Ok(()),
+            Some((name, _, message)) => Err(TrainError::Value { name: name.to_owned(), message }),
+        }
+    }
+
+    /// The resolved configuration as TOML.
+    ///
+    /// # Errors
+    /// [`TrainError::Value`] when it cannot be written as TOML.
+    pub fn to_toml(&self) -> Result<String, TrainError> {
+        toml::to_string(self).map_err(|e| TrainError::Value { name: "config".to_owned(), message: e.to_string() })
+    }
+}
+
+/// A plugin's resolved parameters, which carry its name, as a spec.
+fn resolved(mut parameters: serde_json::Map<String, serde_json::Value>) -> Spec {
+    let name = match parameters.remove("name") {
+        Some(serde_json::Value::String(name)) => name,
+        _ => String::new(),
+    };
+    parameters.retain(|_, value| !value.is_null());
+    Spec { name, params: parameters }
+}
