@@ -12,7 +12,7 @@ use crate::registry::Entry;
 /// The registries: a kind's name and its entries. A new registry is one line here.
 const KINDS: &[(&str, fn(&'static str) -> Vec<Listed>)] = &[
     ("scenario", |kind| listed(kind, crate::scenario::SCENARIOS)),
-    ("link", |kind| listed(kind, crate::link::LINKS)),
+    ("link", |kind| listed(kind, link::LINKS)),
     ("policy", |kind| listed(kind, crate::record::POLICIES)),
     ("format", |kind| listed(kind, crate::storage::FORMATS)),
     ("algorithm", |kind| listed(kind, crate::algo::ALGORITHMS)),
