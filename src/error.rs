@@ -1,10 +1,13 @@
 //! The crate's error: one enum per room, wrapped here, and the exit code each deserves.
 
 use crate::io::IoError;
+use crate::mi::MiError;
+use crate::pairs::PairsError;
 use crate::record::RecordError;
 use crate::registry::RegistryError;
 use crate::schema::SchemaError;
 use crate::storage::StorageError;
+use crate::train::TrainError;
 
 /// Any error of the crate.
 #[derive(Debug, thiserror::Error)]
@@ -15,6 +18,12 @@ pub enum Error {
     /// A plugin's name or parameters.
     #[error(transparent)]
     Registry(#[from] RegistryError),
+    /// Samples from a store or a table.
+    #[error(transparent)]
+    Pairs(#[from] PairsError),
+    /// Samples that cannot carry an estimate.
+    #[error(transparent)]
+    Mi(#[from] MiError),
     /// Recording.
     #[error(transparent)]
     Record(#[from] RecordError),
@@ -24,14 +33,20 @@ pub enum Error {
     /// A store.
     #[error(transparent)]
     Storage(#[from] StorageError),
+    /// Training and evaluation.
+    #[error(transparent)]
+    Train(#[from] TrainError),
 }
 
 impl Error {
     /// Whether the user's words are at fault (exit code 2), not the data or the machine (exit code 1).
     pub fn is_usage(&self) -> bool {
+        let exists = |e: &IoError| matches!(e, IoError::Exists(_));
         match self {
-            Self::Registry(_) | Self::Io(IoError::Exists(_)) | Self::Record(RecordError::NoEpisodes) => true,
-            Self::Storage(StorageError::Io(IoError::Exists(_))) => true,
+            Self::Pairs(error) => error.is_usage(),
+            Self::Registry(_) | Self::Record(RecordError::NoEpisodes) => true,
+            Self::Train(TrainError::Registry(_) | TrainError::Config { .. } | TrainError::Value { .. }) => true,
+            Self::Io(e) | Self::Storage(StorageError::Io(e)) | Self::Train(TrainError::Io(e)) => exists(e),
             _ => false,
         }
     }

@@ -28,7 +28,7 @@ pub enum IoError {
     #[error("no such file or directory: {}", .0.display())]
     Missing(PathBuf),
     /// `--force` would replace something that this program did not make.
-    #[error("refusing to replace a directory that ccmarl did not make; remove it by hand: {}", .0.display())]
+    #[error("refusing to replace what ccmarl did not make; remove it by hand, or give another --out: {}", .0.display())]
     Foreign(PathBuf),
 }
 
@@ -110,6 +110,8 @@ pub fn publish(from: &Path, to: &Path, force: bool, marker: &str) -> Result<(), 
             return Err(IoError::Foreign(to.to_owned()));
         }
         std::fs::remove_dir_all(to).map_err(IoError::os("replace", to))?;
+    } else if from.is_dir() && to.symlink_metadata().is_ok() {
+        std::fs::remove_file(to).map_err(IoError::os("replace", to))?;
     }
     std::fs::rename(from, to).map_err(IoError::os("put in place", to))?;
     sync_dir(to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")))

@@ -105,8 +105,21 @@ impl Spec {
     /// # Errors
     /// [`RegistryError::Params`] that names the field.
     pub fn params<P: DeserializeOwned>(&self) -> Result<P, RegistryError> {
-        serde_json::from_value(Value::Object(self.params.clone()))
-            .map_err(|e| RegistryError::Params { name: self.name.clone(), message: e.to_string() })
+        let read = |params: Map<String, Value>| {
+            serde_json::from_value::<P>(Value::Object(params)).map_err(|error| error.to_string())
+        };
+        read(self.params.clone()).map_err(|message| {
+            // The parser does not say which field: it is the one without which there is no error, or another one.
+            let culprit = self.params.keys().find(|key| {
+                let mut others = self.params.clone();
+                others.shift_remove(*key);
+                read(others).err().as_ref() != Some(&message)
+            });
+            match culprit {
+                Some(key) if !message.contains(&format!("`{key}`")) => self.invalid(format!("{key}: {message}")),
+                _ => self.invalid(message),
+            }
+        })
     }
 
     /// Checks that the parameter `key` lies in `[low, high]`.
@@ -206,6 +219,24 @@ mod tests {
         assert_eq!(spec.to_string(), "dropout:0.2");
         assert_eq!(serde_json::to_string(&spec).unwrap(), r#"{"name":"dropout","p":0.2}"#);
         assert_eq!(serde_json::from_str::<Spec>(r#"{"name":"dropout","p":0.2}"#).unwrap(), spec);
+    }
+
+    #[test]
+    fn an_error_names_its_field() {
+        #[derive(Debug, Deserialize)]
+        #[serde(deny_unknown_fields)]
+        struct Params {
+            #[expect(dead_code, reason = "only read")]
+            p: f64,
+            #[expect(dead_code, reason = "only read")]
+            n: Option<usize>,
+        }
+        let error = |spec: Spec| spec.params::<Params>().unwrap_err().to_string();
+        let spec = Spec::new("x").with("n", 1);
+        assert_eq!(error(spec.clone().with("p", "high")), "x: p: invalid type: string \"high\", expected f64");
+        assert_eq!(error(spec.clone()), "x: missing field `p`");
+        assert_eq!(error(spec.clone().with("p", 1).with("q", 1)), "x: unknown field `q`, expected `p` or `n`");
+        assert!(error(spec.with("p", 1).with("n", -1)).starts_with("x: n: invalid value: integer `-1`"));
     }
 
     #[test]

@@ -160,12 +160,17 @@ impl Actors {
         Ok(safetensors::serialize(tensors, Some(metadata.into_iter().collect()))?)
     }
 
+    /// The actor file of a run directory; `path` itself when it is a file.
+    pub fn file(path: &Path) -> PathBuf {
+        if path.is_dir() { path.join("checkpoint").join("actors.safetensors") } else { path.to_owned() }
+    }
+
     /// Reads the actors of a run directory (or an actor file) and their parameters.
     ///
     /// # Errors
     /// [`RunPolicyError::Unreadable`].
     pub fn load(path: &Path) -> Result<(Self, Vec<f32>), RunPolicyError> {
-        let file = if path.is_dir() { path.join("checkpoint").join("actors.safetensors") } else { path.to_owned() };
+        let file = Self::file(path);
         let fail = |message: String| RunPolicyError::Unreadable { message, path: file.clone() };
         let bytes = std::fs::read(&file)
             .map_err(|e| fail(format!("{e} (give the directory that `ccmarl train --out` wrote)")))?;

@@ -200,7 +200,7 @@ impl Maddpg {
         self.scratch.inputs.resize_with(self.actors.len(), Vec::new);
 
         // 1. target: y = r + bonus + γ Q⁻(o', π⁻(o', M'))
-        let Scratch { joint, inputs, actor_tapes, critic_tape, grad_q, target, .. } = &mut self.scratch;
+        let Scratch { joint, inputs, actor_tapes, critic_tape, grad_q, target, critic_grads, .. } = &mut self.scratch;
         let target_actors = self.params.target_actors.read();
         joint_rows(joint, &batch.next_observations, rows, widths);
         for i in 0..self.actors.len() {
@@ -223,7 +223,6 @@ impl Maddpg {
         grad_q.clear();
         grad_q.extend(q.iter().zip(target.iter()).map(|(q, y)| 2.0 * (q - y) / rows as f32));
         let td_loss = grad_q.iter().map(|&g| (f64::from(g) * rows as f64 / 2.0).powi(2)).sum::<f64>() / rows as f64;
-        let critic_grads = &mut self.scratch.critic_grads;
         critic_grads.clear();
         critic_grads.resize(critic_params.len(), 0.0);
         self.critic.backward(&critic_params, joint, critic_tape, grad_q, critic_grads, None);

@@ -1,6 +1,5 @@
 //! Arguments that several commands share.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde_json::Value;
@@ -46,10 +45,11 @@ impl ScenarioArgs {
     }
 }
 
-/// A flag that SIGINT and SIGTERM raise, so that a command can end in good order (exit code 4).
-pub(super) fn stop_flag() -> anyhow::Result<Arc<AtomicBool>> {
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = Arc::clone(&stop);
-    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed))?;
-    Ok(stop)
+/// A flag that SIGINT and SIGTERM raise, so that a command can end in good order (exit code 4). One per process.
+pub(super) fn stop_flag() -> anyhow::Result<&'static AtomicBool> {
+    static STOP: AtomicBool = AtomicBool::new(false);
+    match ctrlc::set_handler(|| STOP.store(true, Ordering::Relaxed)) {
+        Ok(()) | Err(ctrlc::Error::MultipleHandlers) => Ok(&STOP),
+        Err(error) => Err(error.into()),
+    }
 }

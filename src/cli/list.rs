@@ -15,6 +15,7 @@ const KINDS: &[(&str, fn(&'static str) -> Vec<Listed>)] = &[
     ("link", |kind| listed(kind, link::LINKS)),
     ("policy", |kind| listed(kind, crate::record::POLICIES)),
     ("format", |kind| listed(kind, crate::storage::FORMATS)),
+    ("estimator", |kind| listed(kind, crate::mi::ESTIMATORS)),
     ("algorithm", |kind| listed(kind, crate::algo::ALGORITHMS)),
     ("suite", suites),
     ("channel", channels),

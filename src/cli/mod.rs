@@ -1,9 +1,16 @@
 //! The command line: one file per subcommand. The only place for anyhow, printing, progress bars and tables.
 #![expect(clippy::print_stdout, clippy::print_stderr, reason = "the face of the program prints")]
 
+mod args;
+mod estimate_mi;
+mod evaluate;
 mod generate;
+mod inspect;
 mod list;
+mod quickstart;
 mod record;
+mod report;
+mod train;
 mod ui;
 
 use std::process::ExitCode;
@@ -12,7 +19,14 @@ use clap::{Parser, Subcommand};
 
 /// Record, measure, train and compare agents that talk over unreliable links.
 #[derive(Debug, Parser)]
-#[command(name = "ccmarl", version, about, propagate_version = true, arg_required_else_help = true, max_term_width = 100)]
+#[command(
+    name = "ccmarl",
+    version,
+    about,
+    propagate_version = true,
+    arg_required_else_help = true,
+    max_term_width = 100
+)]
 pub struct Cli {
     /// What to do
     #[command(subcommand)]
@@ -22,12 +36,24 @@ pub struct Cli {
 /// The subcommands.
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Run the whole line once: train, record, estimate, test, report
+    Quickstart(quickstart::Args),
+    /// Record episodes of a scenario under a policy and a link
+    Record(record::Args),
+    /// Show what a recorded store holds
+    Inspect(inspect::Args),
+    /// Estimate how much messages and actions, or any columns, tell about each other
+    EstimateMi(estimate_mi::Args),
+    /// Train a team over a link prior
+    Train(train::Args),
+    /// Test a trained team on every channel of a suite
+    Evaluate(evaluate::Args),
+    /// Render runs as figures, tables and one page
+    Report(report::Args),
     /// List what can be named on the command line: scenarios, links, policies, estimators, algorithms, …
     List(list::Args),
     /// Generate shell completions or manual pages
     Generate(generate::Args),
-    /// Record episodes of a scenario under a policy and a link
-    Record(record::Args),
 }
 
 /// How a command ended, when it did not fail.
@@ -61,8 +87,14 @@ pub fn main() -> ExitCode {
 
 fn dispatch(command: Command) -> anyhow::Result<Outcome> {
     match command {
+        Command::Quickstart(args) => quickstart::run(&args),
+        Command::Record(args) => record::run(&args),
+        Command::Inspect(args) => inspect::run(&args),
+        Command::EstimateMi(args) => estimate_mi::run(&args),
+        Command::Train(args) => train::run(&args),
+        Command::Evaluate(args) => evaluate::run(&args),
+        Command::Report(args) => report::run(&args),
         Command::List(args) => list::run(&args),
         Command::Generate(args) => generate::run(&args),
-        Command::Record(args) => record::run(&args),
     }
 }

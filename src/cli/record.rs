@@ -1,23 +1,23 @@
 //! `ccmarl record`: scenario × policy × link → a store.
 
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use serde_json::{Value, json};
+use serde_json::json;
 
+use super::args::{ScenarioArgs, stop_flag};
 use super::{Outcome, ui};
 use crate::link::{LINKS, Setting};
 use crate::record::{Options, POLICIES, RecordError, Recording, loss_rate};
 use crate::registry::{RegistryError, Spec};
-use crate::scenario::SCENARIOS;
+use crate::schema::Episode;
 use crate::{Error, link, record, scenario, storage};
 
 const EXAMPLES: &str = "\
 Examples:
   ccmarl record --scenario simple_tag --agents 3 --policy random --link dropout:0.2 --episodes 1000 --seed 1 --out data/tag
   ccmarl record --scenario simple_spread --agents 2 --policy probe:0.75 --link markov:heavy --out data/probe.parquet
+  ccmarl record --scenario simple_spread --policy run:runs/x --action-noise 0.3 --link dropout:0.2 --out data/x
   ccmarl record --scenario simple_spread --policy scripted --link distance:3 --set view_radius=0.5 --out data/spread.mcap
 
 The same seed gives the same bytes for any number of threads. Interrupted (Ctrl-C), it seals what is done and exits 4.
@@ -27,18 +27,14 @@ The same seed gives the same bytes for any number of threads. Interrupted (Ctrl-
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub(super) struct Args {
-    /// Scenario: name or name:agents
-    #[arg(long)]
-    scenario: String,
-    /// Number of agents under policy control [default: the scenario's]
-    #[arg(long)]
-    agents: Option<u32>,
-    /// Scenario parameter, as often as needed: key=value
-    #[arg(long = "set", value_name = "KEY=VALUE")]
-    overrides: Vec<String>,
+    #[command(flatten)]
+    scenario: ScenarioArgs,
     /// Policy: name or name:value
     #[arg(long, default_value = "random")]
     policy: String,
+    /// Exploration noise of a trained policy (run:DIR): standard deviation
+    #[arg(long, value_name = "SIGMA")]
+    action_noise: Option<f64>,
     /// Link: name or name:value
     #[arg(long, default_value = "perfect")]
     link: String,
@@ -65,41 +61,41 @@ pub(super) struct Args {
 /// Running mean and standard deviation of returns, and the mean loss rate.
 #[derive(Default)]
 struct Summary {
+    episodes: u64,
     steps: usize,
-    returns: Vec<f64>,
+    mean: f64,
+    /// Sum of squared deviations from the mean (Welford).
+    squares: f64,
     losses: f64,
 }
 
 /// Runs the command.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
-    let scenario = scenario::build(&scenario_spec(args)?).map_err(Error::from)?;
+    let spec = args.scenario.spec(None)?.ok_or_else(|| RegistryError::Params {
+        name: "record".to_owned(),
+        message: "give --scenario NAME (`ccmarl list` shows all)".to_owned(),
+    });
+    let scenario = scenario::build(&spec.map_err(Error::from)?).map_err(Error::from)?;
     let link_spec = Spec::parse("link", LINKS, &args.link).map_err(Error::from)?;
     let setting = Setting { distance_unit: scenario.link_unit() };
     let link = link::build(&link_spec, &setting).map_err(Error::from)?;
-    let policy_spec = Spec::parse("policy", POLICIES, &args.policy).map_err(Error::from)?;
+    let mut policy_spec = Spec::parse("policy", POLICIES, &args.policy).map_err(Error::from)?;
+    if let Some(sigma) = args.action_noise {
+        policy_spec = policy_spec.with("action_noise", sigma);
+    }
     let policy = record::build_policy(&policy_spec, &*scenario).map_err(Error::from)?;
-    let recording = Recording {
-        scenario: &*scenario,
-        link: &*link,
-        policy: &*policy,
-        seed: args.seed,
-        episodes: args.episodes,
-    };
+    let recording =
+        Recording { scenario: &*scenario, link: &*link, policy: &*policy, seed: args.seed, episodes: args.episodes };
     if args.episodes == 0 {
         return Err(Error::from(RecordError::NoEpisodes).into());
     }
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = Arc::clone(&stop);
-    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed))?;
-
+    let stop = stop_flag()?;
     let mut sink = storage::create(&args.out, &recording.manifest(), args.force).map_err(Error::from)?;
     let communicators = recording.layout().communicators().len();
     let bar = ui::progress(args.episodes, "episodes");
     let (mut summary, mut said) = (Summary::default(), Instant::now());
-    let mut committed = |episode: &crate::schema::Episode| {
-        summary.steps += episode.steps;
-        summary.returns.push(episode.episode_return());
-        summary.losses += loss_rate(episode, communicators);
+    let mut committed = |episode: &Episode| {
+        summary.add(episode, loss_rate(episode, communicators));
         bar.inc(1);
         if said.elapsed() > Duration::from_millis(900) {
             said = Instant::now();
@@ -107,7 +103,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         }
     };
     let options = Options { threads: args.threads, block: 0 };
-    let recorded = recording.record(&mut *sink, options, &mut committed, &stop).map_err(Error::from)?;
+    let recorded = recording.record(&mut *sink, options, &mut committed, stop).map_err(Error::from)?;
     bar.finish_and_clear();
     if recorded.episodes == 0 {
         ui::say("interrupted before the first episode: nothing was written");
@@ -124,42 +120,31 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// The scenario as named, with `--agents` and `--set`.
-fn scenario_spec(args: &Args) -> Result<Spec, Error> {
-    let mut spec = Spec::parse("scenario", SCENARIOS, &args.scenario)?;
-    if let Some(agents) = args.agents {
-        spec = spec.with("agents", agents);
-    }
-    for pair in &args.overrides {
-        let Some((key, value)) = pair.split_once('=') else {
-            let message = format!("--set takes key=value, found {pair:?}");
-            return Err(RegistryError::Params { name: spec.name, message }.into());
-        };
-        let value = serde_json::from_str::<Value>(value).unwrap_or_else(|_| Value::from(value));
-        spec = spec.with(key, value);
-    }
-    Ok(spec)
-}
-
 impl Summary {
+    fn add(&mut self, episode: &Episode, loss_rate: f64) {
+        self.episodes += 1;
+        self.steps += episode.steps;
+        let deviation = episode.episode_return() - self.mean;
+        self.mean += deviation / self.episodes as f64;
+        self.squares += deviation * (episode.episode_return() - self.mean);
+        self.losses += loss_rate;
+    }
+
     fn print(&self, args: &Args, recording: &Recording<'_>) -> anyhow::Result<()> {
-        let n = self.returns.len() as f64;
-        let mean = self.returns.iter().sum::<f64>() / n;
-        let squares = self.returns.iter().map(|r| (r - mean) * (r - mean)).sum::<f64>();
-        let std = (squares / (n - 1.0).max(1.0)).sqrt();
-        let loss = self.losses / n;
+        let n = self.episodes as f64;
+        let (mean, std, loss) = (self.mean, (self.squares / (n - 1.0).max(1.0)).sqrt(), self.losses / n);
         let out = args.out.display().to_string();
         let manifest = recording.manifest();
         match args.format {
             ui::Format::Json => ui::print_json(&json!({
-                "out": out, "episodes": self.returns.len(), "steps": self.steps, "seed": args.seed,
+                "out": out, "episodes": self.episodes, "steps": self.steps, "seed": args.seed,
                 "scenario": manifest.scenario, "link": manifest.link, "policy": manifest.policy,
                 "return_mean": mean, "return_std": std, "loss_rate": loss,
             })),
             ui::Format::Table => {
                 let rows = [
                     ("store", out),
-                    ("episodes", self.returns.len().to_string()),
+                    ("episodes", self.episodes.to_string()),
                     ("steps", self.steps.to_string()),
                     ("return", format!("{mean:.2} ± {std:.2} (std over episodes)")),
                     ("return counts", recording.scenario.reward_convention().to_owned()),

@@ -107,7 +107,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
             bar.set_message(format!("return {mean:8.1}"));
         }
     };
-    let report = train::train(config, &args.out, &options, &mut progress, &stop).map_err(Error::from)?;
+    let report = train::train(config, &args.out, &options, &mut progress, stop).map_err(Error::from)?;
     bar.finish_and_clear();
     let out = args.out.display().to_string();
     match args.format {

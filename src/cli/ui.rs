@@ -10,7 +10,7 @@ use serde::Serialize;
 
 /// How results are printed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
-pub enum Format {
+pub(super) enum Format {
     /// For people.
     #[default]
     Table,
@@ -21,13 +21,13 @@ pub enum Format {
 /// The writer behind a broken pipe: the reader has left, which is no error.
 #[derive(Debug, thiserror::Error)]
 #[error("broken pipe")]
-pub struct BrokenPipe;
+pub(super) struct BrokenPipe;
 
 /// Prints `text` and a line end on stdout.
 ///
 /// # Errors
 /// [`BrokenPipe`] when the reader has left; the caller just ends.
-pub fn print(text: &str) -> anyhow::Result<()> {
+pub(super) fn print(text: &str) -> anyhow::Result<()> {
     let mut out = std::io::stdout().lock();
     match writeln!(out, "{text}").and_then(|()| out.flush()) {
         Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Err(BrokenPipe.into()),
@@ -39,7 +39,7 @@ pub fn print(text: &str) -> anyhow::Result<()> {
 ///
 /// # Errors
 /// When stdout is closed.
-pub fn print_json(value: &impl Serialize) -> anyhow::Result<()> {
+pub(super) fn print_json(value: &impl Serialize) -> anyhow::Result<()> {
     print(&serde_json::to_string_pretty(value)?)
 }
 
@@ -47,7 +47,7 @@ pub fn print_json(value: &impl Serialize) -> anyhow::Result<()> {
 ///
 /// # Errors
 /// When stdout is closed.
-pub fn print_table(header: &[&str], rows: &[Vec<String>]) -> anyhow::Result<()> {
+pub(super) fn print_table(header: &[&str], rows: &[Vec<String>]) -> anyhow::Result<()> {
     let mut table = comfy_table::Table::new();
     table.load_style(comfy_table::presets::NOTHING);
     table.set_header(header.to_vec());
@@ -59,12 +59,12 @@ pub fn print_table(header: &[&str], rows: &[Vec<String>]) -> anyhow::Result<()> 
 }
 
 /// Says something to the user on stderr.
-pub fn say(text: &str) {
+pub(super) fn say(text: &str) {
     eprintln!("{text}");
 }
 
 /// A progress bar with rate and ETA on stderr; silent when stderr is no terminal.
-pub fn progress(total: u64, what: &'static str) -> ProgressBar {
+pub(super) fn progress(total: u64, what: &'static str) -> ProgressBar {
     let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(8));
     let template = "{msg:>14} {bar:32} {human_pos}/{human_len} {per_sec:.dim} ETA {eta}";
     if let Ok(style) = ProgressStyle::with_template(template) {
@@ -76,7 +76,7 @@ pub fn progress(total: u64, what: &'static str) -> ProgressBar {
 }
 
 /// Prints an error once, as one line, and gives its exit code: 2 when the user's words are at fault, else 1.
-pub fn report_error(error: &anyhow::Error) -> ExitCode {
+pub(super) fn report_error(error: &anyhow::Error) -> ExitCode {
     if error.is::<BrokenPipe>() {
         return ExitCode::SUCCESS;
     }

@@ -2,7 +2,7 @@
 //! A radio of limited range.
 //!
 //! # Definition
-//! ι^{ji} = 1 if |p_j − p_i| ≤ threshold · unit at the time of sending, else 0. Hard and symmetric.
+//! ι^{ji} = 1 if `|p_j − p_i|` ≤ threshold · unit at the time of sending, else 0. Hard and symmetric.
 //!
 //! # Shapes and units
 //! Bits `[N, N]`; `threshold` in units of `unit` world units.
@@ -29,7 +29,7 @@ use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
 
 /// The link's line in the registry.
-pub const ENTRY: Entry<Build> = Entry {
+pub(super) const ENTRY: Entry<Build> = Entry {
     name: "distance",
     summary: "messages reach as far as threshold × unit",
     reference: "arXiv 2512.03528, DBC",

@@ -27,7 +27,7 @@ use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::{Seeds, Stream, bernoulli};
 
 /// The link's line in the registry.
-pub const ENTRY: Entry<Build> = Entry {
+pub(super) const ENTRY: Entry<Build> = Entry {
     name: "dropout",
     summary: "each message is lost with probability p",
     reference: "Kim, Cho and Sung 2019 (Message-Dropout)",

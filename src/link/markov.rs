@@ -3,7 +3,7 @@
 //!
 //! # Definition
 //! State 0 delivers, every other state loses. A chain starts in state 0 at the start of an episode and emits before it
-//! moves, so that the first message always arrives. In the named levels, state s goes back to 0 with probability p_s,
+//! moves, so that the first message always arrives. In the named levels, state s goes back to 0 with probability `p_s`,
 //! else on to s + 1 (the last one stays): light p = .99 .85 .91; medium .94 .60 .71 .87 .97 .99; heavy .90 .81 .45 .61
 //! .37 .77 .89 .93.
 //!
@@ -30,7 +30,7 @@ use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::{Seeds, Stream, uniform};
 
 /// The link's line in the registry.
-pub const ENTRY: Entry<Build> = Entry {
+pub(super) const ENTRY: Entry<Build> = Entry {
     name: "markov",
     summary: "bursty loss: a Markov chain per link (light, medium, heavy, or a matrix)",
     reference: "Zhang et al. 2020 (TMC), 802.11ac traces",
@@ -204,9 +204,7 @@ mod tests {
 
     #[test]
     fn malformed_chains_are_refused() {
-        let error = |json: &str| {
-            build(&serde_json::from_str(json).unwrap(), &SETTING).err().unwrap().to_string()
-        };
+        let error = |json: &str| build(&serde_json::from_str(json).unwrap(), &SETTING).err().unwrap().to_string();
         assert_eq!(
             error(r#"{"name":"markov","matrix":[[0.5,0.4],[1,0]]}"#),
             "markov: matrix row 0 must sum to 1, found 0.9"

@@ -1,4 +1,4 @@
-//! Links: which messages arrive. A link prior f_θ of the paper (Eq. 1), also used as test channel.
+//! Links: which messages arrive. A link prior `f_θ` of the paper (Eq. 1), also used as test channel.
 //!
 //! A link is immutable; the state of one episode's links is a [`LinkEpisode`]. Every directed link draws from its own
 //! stream, so the same bits come out for any thread and agent order. Adding one: write `link/<name>.rs` with an
@@ -23,7 +23,7 @@ use crate::rng::{Seeds, Stream};
 pub const LINKS: &[Entry<Build>] = &[perfect::ENTRY, none::ENTRY, dropout::ENTRY, markov::ENTRY, distance::ENTRY];
 
 /// What a link may want to know about the scenario it is used in.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct Setting {
     /// World units of one unit of distance, where the user gave none.
     pub distance_unit: f64,

@@ -27,7 +27,7 @@ use crate::registry::Entry;
 use crate::rng::Seeds;
 
 /// The link's line in the registry.
-pub const ENTRY: Entry<Build> = Entry {
+pub(super) const ENTRY: Entry<Build> = Entry {
     name: "perfect",
     summary: "every message arrives",
     reference: "arXiv 2512.03528, unrestricted",

@@ -35,7 +35,8 @@ pub fn suite(name: &str) -> Result<Vec<Channel>, RegistryError> {
         let hint = did_you_mean(name, SUITES.iter().copied());
         return Err(RegistryError::Unknown { kind: "suite", name: name.to_owned(), hint });
     }
-    let channel = |&(id, link): &(&'static str, &str)| Ok(Channel { id, spec: Spec::parse("link", super::LINKS, link)? });
+    let channel =
+        |&(id, link): &(&'static str, &str)| Ok(Channel { id, spec: Spec::parse("link", super::LINKS, link)? });
     PAPER.iter().map(channel).collect()
 }
 

@@ -115,7 +115,7 @@ impl Mlp {
 
     /// Number of parameters.
     pub fn parameters(&self) -> usize {
-        self.weight(self.layers()).1
+        self.widths.windows(2).map(|w| w[1] * (w[0] + 1)).sum()
     }
 
     fn activation(&self, layer: usize) -> Activation {

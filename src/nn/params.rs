@@ -19,7 +19,7 @@ pub struct Params {
 /// A read lock on parameters; dereferences to the slice.
 #[derive(Debug)]
 pub struct ParamsRef<'a> {
-    storage: std::sync::RwLockReadGuard<'a, Storage>,
+    storage: candle_core::StorageRef<'a>,
 }
 
 impl Deref for ParamsRef<'_> {

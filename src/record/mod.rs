@@ -3,10 +3,12 @@
 mod probe;
 mod random;
 mod rollout;
+mod run;
 mod scripted;
 
 use serde_json::{Map, Value};
 
+pub use run::{ActionNoise, Trained};
 pub use rollout::{EpisodeReturn, Options, Recorded, Recording, loss_rate, returns};
 
 use crate::registry::{Entry, RegistryError, Spec};
@@ -16,7 +18,7 @@ use crate::schema::{AgentSpec, Controller};
 use crate::storage::StorageError;
 
 /// All policies that can be recorded.
-pub const POLICIES: &[Entry<Build>] = &[random::ENTRY, scripted::ENTRY, probe::ENTRY];
+pub const POLICIES: &[Entry<Build>] = &[probe::ENTRY, random::ENTRY, run::ENTRY, scripted::ENTRY];
 
 /// What goes wrong when recording.
 #[derive(Debug, thiserror::Error)]

@@ -4,8 +4,8 @@
 //! # Definition
 //! Every communicator sends m ~ N(0, 1). A receiver of k > 0 delivered messages acts
 //! `a_0 = ρ Σ m / √k + √(1 − ρ²) ε`, else `a_0 = ε`, with ε ~ N(0, 1); other action components are independent N(0, 1).
-//! With one sender I(m; a_0) = −½ ln(1 − ρ²) nats when delivered (0.4133 at ρ = 0.75). With more, each of the k delivered
-//! messages shares −½ ln(1 − ρ²/k) with a_0, and over rows of mixed k the law is a mixture of these. A lost message
+//! With one sender `I(m; a_0)` = −½ ln(1 − ρ²) nats when delivered (0.4133 at ρ = 0.75). With more, each of the k delivered
+//! messages shares −½ ln(1 − ρ²/k) with `a_0`, and over rows of mixed k the law is a mixture of these. A lost message
 //! shares nothing.
 //!
 //! # Shapes and units
@@ -34,7 +34,7 @@ use crate::scenario::Scenario;
 use crate::schema::{AgentSpec, Controller};
 
 /// The policy's line in the registry.
-pub const ENTRY: Entry<Build> = Entry {
+pub(super) const ENTRY: Entry<Build> = Entry {
     name: "probe",
     summary: "Gaussian messages and actions of known mutual information (correlation rho)",
     reference: "the Gaussian channel, −½ ln(1 − ρ²) nats",

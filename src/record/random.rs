@@ -28,7 +28,7 @@ use crate::rng::{Seeds, Stream, uniform};
 use crate::scenario::Scenario;
 
 /// The policy's line in the registry.
-pub const ENTRY: Entry<Build> = Entry {
+pub(super) const ENTRY: Entry<Build> = Entry {
     name: "random",
     summary: "uniform actions; messages are observations",
     reference: "common practice",

@@ -32,7 +32,7 @@ pub struct Recording<'a> {
 pub struct Options {
     /// Threads; 0 is one per core.
     pub threads: usize,
-    /// Episodes computed at once; 0 chooses by their size. At most three blocks are in memory.
+    /// Episodes computed at once; 0 chooses by their size. At most two blocks are in memory.
     pub block: usize,
 }
 
@@ -124,8 +124,8 @@ impl Recording<'_> {
     }
 
     /// Computes all episodes in blocks, in parallel, and appends them in order. The sink is called from this thread
-    /// while the next block is computed. `committed` is told of every episode that the sink has taken; when `stop`
-    /// turns true the recording ends after the episode at hand.
+    /// while the next block is computed. `committed` is told of every episode once it survives a kill; when `stop`
+    /// turns true the recording ends after the block at hand.
     ///
     /// # Errors
     /// [`RecordError::NoEpisodes`], [`RecordError::Storage`] when the sink refuses, [`RecordError::Threads`].
@@ -148,7 +148,7 @@ impl Recording<'_> {
         let block = if options.block == 0 { default_block(&layout, self.scenario.steps()) } else { options.block };
         let mut done = 0;
         std::thread::scope(|scope| {
-            let (send, receive) = sync_channel::<Vec<Episode>>(1);
+            let (send, receive) = sync_channel::<Vec<Episode>>(0);
             let (layout, pool) = (&layout, &pool);
             scope.spawn(move || {
                 let mut next = 0;
@@ -161,13 +161,13 @@ impl Recording<'_> {
                     next = end;
                 }
             });
-            for episode in receive.iter().flatten() {
+            for block in receive {
                 if stop.load(Ordering::Relaxed) {
                     break;
                 }
-                sink.append(&episode)?;
-                done += 1;
-                committed(&episode);
+                block.iter().try_for_each(|episode| sink.append(episode))?;
+                done = sink.commit()?;
+                block.iter().for_each(&mut *committed);
             }
             Ok(Recorded { episodes: done, interrupted: done < self.episodes })
         })

@@ -20,19 +20,21 @@
 //! # Differences from the reference implementation
 //! One noise process per component instead of one object shared by all agents and advanced once per agent.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use super::{Build, Policy, PolicyEpisode, View};
 use crate::algo::Actors;
+use crate::io::IoError;
 use crate::nn::Tape;
-use crate::registry::{Entry, RegistryError, Spec};
+use crate::registry::Entry;
 use crate::rng::{self, Seeds, Stream};
 use crate::scenario::{Scenario, offsets};
 use crate::schema::AgentSpec;
 
+/// The policy's line in the registry.
 pub(super) const ENTRY: Entry<Build> = Entry {
     name: "run",
     summary: "a trained team: run:DIR, the directory that `ccmarl train --out` wrote",
@@ -54,15 +56,22 @@ pub(super) const ENTRY: Entry<Build> = Entry {
         actors.check_fit(&learners(scenario), &params.path).map_err(|e| spec.invalid(e.to_string()))?;
         let noise =
             if params.action_noise > 0.0 { ActionNoise::Gaussian(params.action_noise) } else { ActionNoise::None };
-        Ok(Box::new(Trained { actors, params: values, noise, parameters: described(spec) }))
+        let parameters = described(&params.path, params.action_noise).map_err(|e| spec.invalid(e.to_string()))?;
+        Ok(Box::new(Trained { actors, params: values, noise, parameters }))
     },
 };
 
-/// What the manifest records: the run's name, never an absolute path of this machine.
-fn described(spec: &Spec) -> Map<String, Value> {
-    let mut parameters = Map::from_iter([("name".to_owned(), Value::from(spec.name.clone()))]);
-    parameters.extend(spec.params.clone());
-    parameters
+/// What the manifest records: the run's own name and the digest of its actors, so that equal runs at different places
+/// give equal stores.
+fn described(path: &Path, action_noise: f64) -> Result<Map<String, Value>, IoError> {
+    let (sha256, _) = crate::io::sha256_file(&Actors::file(path))?;
+    let run = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    let fields = [
+        ("run", Value::from(run)),
+        ("actors_sha256", Value::from(sha256)),
+        ("action_noise", Value::from(action_noise)),
+    ];
+    Ok(super::resolved(ENTRY.name, &fields))
 }
 
 fn learners(scenario: &dyn Scenario) -> Vec<&AgentSpec> {
@@ -116,7 +125,7 @@ impl Policy for Trained {
             process: vec![0.0; learners.iter().map(|&a| agents[a].action).sum()],
             observation: learners.iter().map(|&a| [observation_offsets[a], observation_offsets[a + 1]]).collect(),
             action: learners.iter().map(|&a| [action_offsets[a], action_offsets[a + 1]]).collect(),
-            sends: senders(agents),
+            scenario,
             row: Vec::new(),
             input: Vec::new(),
             tape: Tape::default(),
@@ -124,19 +133,13 @@ impl Policy for Trained {
     }
 }
 
-/// Observation range of every agent that sends, in order.
-fn senders(agents: &[AgentSpec]) -> Vec<[usize; 2]> {
-    let at = offsets(agents, |a| a.observation);
-    (0..agents.len()).filter(|&a| agents[a].message > 0).map(|a| [at[a], at[a + 1]]).collect()
-}
-
 struct Acting<'a> {
     team: &'a Trained,
+    scenario: &'a dyn Scenario,
     noise: Stream,
     process: Vec<f64>,
     observation: Vec<[usize; 2]>,
     action: Vec<[usize; 2]>,
-    sends: Vec<[usize; 2]>,
     row: Vec<f32>,
     input: Vec<f32>,
     tape: Tape,
@@ -144,11 +147,7 @@ struct Acting<'a> {
 
 impl PolicyEpisode for Acting<'_> {
     fn send(&mut self, observations: &[f32], messages: &mut [f32]) {
-        let mut at = 0;
-        for &[from, to] in &self.sends {
-            messages[at..at + to - from].copy_from_slice(&observations[from..to]);
-            at += to - from;
-        }
+        super::send_observations(self.scenario.agents(), observations, messages);
     }
 
     fn act(&mut self, view: &View<'_>, actions: &mut [f32]) {

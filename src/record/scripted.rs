@@ -28,7 +28,7 @@ use crate::rng::Seeds;
 use crate::scenario::Scenario;
 
 /// The policy's line in the registry.
-pub const ENTRY: Entry<Build> = Entry {
+pub(super) const ENTRY: Entry<Build> = Entry {
     name: "scripted",
     summary: "the scenario's oracle, which sees everything",
     reference: "this program",

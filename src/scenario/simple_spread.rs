@@ -4,7 +4,7 @@
 //! # Definition
 //! Agents and landmarks start uniform in [-1, 1]², at rest. After each step agent i earns
 //! `r_i = −Σ_l min_a |p_a − p_l| − #{a : |p_a − p_i| < 2 size} + cover_bonus · [every landmark has an agent within
-//! cover_radius]`; the count includes i itself (`self_collision`). The team reward is the SUM of all r_i.
+//! cover_radius]`; the count includes i itself (`self_collision`). The team reward is the SUM of all `r_i`.
 //!
 //! # Shapes and units
 //! Observation `4 + 2N + 4(N − 1)` (18 at N = 3), world units: own velocity, own position, landmarks relative, others
@@ -34,7 +34,7 @@ use crate::rng::Stream;
 use crate::schema::{AgentSpec, Controller};
 
 /// The scenario's line in the registry.
-pub const ENTRY: Entry<Build> = Entry {
+pub(super) const ENTRY: Entry<Build> = Entry {
     name: "simple_spread",
     summary: "N agents cover N landmarks and avoid collisions",
     reference: "Lowe et al. 2017 (MPE); reward scale of PMIC",
@@ -45,47 +45,47 @@ pub const ENTRY: Entry<Build> = Entry {
 /// Every constant of the task. Lengths in world units, speeds per second.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct Params {
+struct Params {
     /// Only `paper` for now.
-    pub profile: String,
+    profile: String,
     /// N, also the number of landmarks: 1 to 1000.
-    pub agents: usize,
+    agents: usize,
     /// T: 1 to 10000.
-    pub steps: usize,
+    steps: usize,
     /// From action to force.
-    pub decoder: Decoder,
+    decoder: Decoder,
     /// Seconds in a step: [1e-4, 1].
-    pub dt: f64,
+    dt: f64,
     /// Share of velocity lost per step: [0, 1].
-    pub damping: f64,
+    damping: f64,
     /// Force per unit of overlap: [0, 1e4].
-    pub contact_force: f64,
+    contact_force: f64,
     /// Softness of contacts: [1e-9, 1].
-    pub contact_margin: f64,
+    contact_margin: f64,
     /// Order of integration.
-    pub integration: Integration,
+    integration: Integration,
     /// Gain from control to force: [0, 100].
-    pub accel: f64,
+    accel: f64,
     /// Top speed: (0, 100], or none.
-    pub max_speed: Option<f64>,
+    max_speed: Option<f64>,
     /// Radius of an agent: [0, 1].
-    pub agent_size: f64,
+    agent_size: f64,
     /// Whether agents push each other.
-    pub collide: bool,
+    collide: bool,
     /// Half width of the square in which bodies start: [0, 100].
-    pub arena: f64,
+    arena: f64,
     /// How far others are seen: [0, 1000], or everywhere.
-    pub view_radius: Option<f64>,
+    view_radius: Option<f64>,
     /// Whether `view_radius` hides landmarks too.
-    pub mask_landmarks: bool,
+    mask_landmarks: bool,
     /// Reward lost per collision: [0, 1000].
-    pub collision_penalty: f64,
+    collision_penalty: f64,
     /// Whether each agent counts as colliding with itself, a constant −1 (as the original code does).
-    pub self_collision: bool,
+    self_collision: bool,
     /// Distance at which a landmark counts as covered: [0, 10].
-    pub cover_radius: f64,
+    cover_radius: f64,
     /// Earned by each agent while all are covered: [-1000, 1000].
-    pub cover_bonus: f64,
+    cover_bonus: f64,
 }
 
 impl Default for Params {

@@ -26,9 +26,9 @@
 //! 2512.03528.
 //!
 //! # Differences from the reference implementation
-//! Candidates are drawn by rejection from the square (there: radius and angle), at 32 bits per coordinate: the same
-//! distribution without trigonometry. One prey and two obstacles at every N, as PMIC has it. The prey's reward, which
-//! is never computed there, is 0.
+//! Candidates are drawn by rejection from the square (there: radius and angle), at 24 bits per coordinate, and scored in
+//! `f32`: the same distribution without trigonometry. One prey and two obstacles at every N, as PMIC has it. The prey's
+//! reward, which is never computed there, is 0.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
@@ -41,7 +41,7 @@ use crate::schema::{AgentSpec, Controller};
 mod prey;
 
 /// The scenario's line in the registry.
-pub const ENTRY: Entry<Build> = Entry {
+pub(super) const ENTRY: Entry<Build> = Entry {
     name: "simple_tag",
     summary: "N predators catch one scripted prey among obstacles",
     reference: "Lowe et al. 2017 (MPE); FACMAC and PMIC's partially observed variant",
@@ -52,61 +52,61 @@ pub const ENTRY: Entry<Build> = Entry {
 /// Every constant of the task. Lengths in world units, speeds per second.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct Params {
+struct Params {
     /// Only `paper` for now.
-    pub profile: String,
+    profile: String,
     /// N, the number of predators: 1 to 1000.
-    pub agents: usize,
+    agents: usize,
     /// T: 1 to 10000.
-    pub steps: usize,
+    steps: usize,
     /// From action to force.
-    pub decoder: Decoder,
+    decoder: Decoder,
     /// Seconds in a step: [1e-4, 1].
-    pub dt: f64,
+    dt: f64,
     /// Share of velocity lost per step: [0, 1].
-    pub damping: f64,
+    damping: f64,
     /// Force per unit of overlap: [0, 1e4].
-    pub contact_force: f64,
+    contact_force: f64,
     /// Softness of contacts: [1e-9, 1].
-    pub contact_margin: f64,
+    contact_margin: f64,
     /// Order of integration.
-    pub integration: Integration,
+    integration: Integration,
     /// Radius of a predator: [0, 1].
-    pub predator_size: f64,
+    predator_size: f64,
     /// Gain of a predator from control to force: [0, 100].
-    pub predator_accel: f64,
+    predator_accel: f64,
     /// Top speed of a predator: (0, 100], or none.
-    pub predator_max_speed: Option<f64>,
+    predator_max_speed: Option<f64>,
     /// Radius of the prey: [0, 1].
-    pub prey_size: f64,
+    prey_size: f64,
     /// Gain of the prey: [0, 100]. 1 is the code behind the paper, 4 what its agents are declared with.
-    pub prey_accel: f64,
+    prey_accel: f64,
     /// Top speed of the prey: (0, 100], or none.
-    pub prey_max_speed: Option<f64>,
+    prey_max_speed: Option<f64>,
     /// Points the prey considers per step: 1 to 10000.
-    pub prey_candidates: usize,
+    prey_candidates: usize,
     /// Points checked on the way to each: 1 to 100.
-    pub prey_waypoints: usize,
+    prey_waypoints: usize,
     /// Distance from whom the prey maximises.
-    pub prey_score: PreyScore,
+    prey_score: PreyScore,
     /// Number of obstacles: 0 to 100.
-    pub obstacles: usize,
+    obstacles: usize,
     /// Radius of an obstacle: [0, 1].
-    pub obstacle_size: f64,
+    obstacle_size: f64,
     /// Half width of the square in which agents start: [0, 100].
-    pub arena: f64,
+    arena: f64,
     /// Half width of the square in which obstacles stand: [0, 100].
-    pub obstacle_arena: f64,
+    obstacle_arena: f64,
     /// How far a predator sees: [0, 1000], or everywhere.
-    pub view_radius: Option<f64>,
+    view_radius: Option<f64>,
     /// Earned by all predators per contact and step: [-1000, 1000].
-    pub contact_reward: f64,
+    contact_reward: f64,
 }
 
 /// What the prey maximises.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum PreyScore {
+enum PreyScore {
     /// The sum of the distances from all predators (PMIC).
     Sum,
     /// The distance from the nearest (FACMAC's default).

@@ -53,10 +53,10 @@ impl World {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Integration {
-    /// The new velocity moves the position (OpenAI, PMIC).
+    /// The new velocity moves the position (`OpenAI`, PMIC).
     #[default]
     VelocityFirst,
-    /// The old velocity moves the position, then changes (PettingZoo, mpe2): one step of lag.
+    /// The old velocity moves the position, then changes (`PettingZoo`, mpe2): one step of lag.
     PositionFirst,
 }
 

@@ -2,14 +2,25 @@
 //!
 //! Adding a format: write `storage/<name>.rs` with an `ENTRY`, and add `mod <name>;` and `<name>::ENTRY,` below.
 
+mod mcap;
+mod parquet;
+mod tally;
+
 use std::path::{Path, PathBuf};
 
 use crate::io::IoError;
 use crate::registry::Entry;
 use crate::schema::{Episode, Manifest, SchemaError};
+use tally::Tally;
 
-/// All formats, in the order in which a path is offered to them.
-pub const FORMATS: &[Entry<Format>] = &[];
+/// All formats, in the order in which a path is offered to them; the last takes what none claims.
+pub const FORMATS: &[Entry<Format>] = &[mcap::ENTRY, parquet::ENTRY];
+
+/// Largest manifest that is read, bytes.
+const MANIFEST_LIMIT: u64 = 64 << 20;
+
+/// Starts a store at a path, for a manifest, with or without `force`.
+pub type Create = fn(&Path, &Manifest, bool) -> Result<Box<dyn EpisodeSink>, StorageError>;
 
 /// How a format is recognised, written and read.
 #[derive(Clone, Copy, Debug)]
@@ -17,18 +28,27 @@ pub struct Format {
     /// Whether an output path asks for this format (by its extension).
     pub claims: fn(&Path) -> bool,
     /// Starts a store; nothing appears under `path` before [`EpisodeSink::finish`].
-    pub create: fn(&Path, &Manifest, bool) -> Result<Box<dyn EpisodeSink>, StorageError>,
+    pub create: Create,
     /// Opens a store for reading; checks its manifest and digests.
     pub open: fn(&Path) -> Result<Box<dyn EpisodeSource>, StorageError>,
 }
 
 /// Takes episodes in index order and seals them into a store.
-pub trait EpisodeSink {
-    /// Appends the next episode; once this returns, the episode survives the death of the process.
+///
+/// The bytes of the finished store depend on the episodes alone, not on when the caller commits.
+pub trait EpisodeSink: Send {
+    /// Appends the next episode; it is safe only after the next [`EpisodeSink::commit`].
     ///
     /// # Errors
-    /// [`StorageError`] when the episode breaks the schema or the disk refuses.
+    /// [`StorageError`] when the episode is out of order, breaks the schema or holds a NaN, or the disk refuses.
     fn append(&mut self, episode: &Episode) -> Result<(), StorageError>;
+
+    /// Hands all episodes appended so far to the operating system: once this returns they survive the death of the
+    /// process. Returns how many these are. Costs one write; call it per batch of episodes.
+    ///
+    /// # Errors
+    /// [`StorageError`] when the disk refuses.
+    fn commit(&mut self) -> Result<u64, StorageError>;
 
     /// Seals the store under its name and returns the final manifest.
     ///
@@ -71,6 +91,14 @@ pub enum StorageError {
         /// Where.
         path: PathBuf,
     },
+    /// The file ends too early.
+    #[error("cut short: {episodes} of its episodes are whole; record again, or copy the file again: {}", path.display())]
+    Truncated {
+        /// Whole episodes before the cut.
+        episodes: u64,
+        /// Where.
+        path: PathBuf,
+    },
     /// A digest or a structure does not match.
     #[error("damaged: {message}: {}", path.display())]
     Damaged {
@@ -97,9 +125,57 @@ pub fn create(path: &Path, manifest: &Manifest, force: bool) -> Result<Box<dyn E
 /// [`StorageError`] when it is missing, not a store, of a newer version, or damaged.
 pub fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
     if !path.exists() {
+        if crate::io::partial_path(path).exists() {
+            let message = "its recording did not finish (what there is of it is in the hidden .partial beside it): record again with --force";
+            return Err(StorageError::NotAStore { message: message.to_owned(), path: path.to_owned() });
+        }
         return Err(IoError::Missing(path.to_owned()).into());
     }
-    (format_of(path).build.open)(path)
+    let source = (format_of(path).build.open)(path)?;
+    if source.manifest().episodes == 0 {
+        let message = "it holds zero episodes: record again".to_owned();
+        return Err(StorageError::NotAStore { message, path: path.to_owned() });
+    }
+    Ok(source)
+}
+
+/// Where a store is built: checks that `path` and its `.partial` sibling may be replaced, removes an old sibling, makes
+/// the directories above. With `force`, only empty directories and what ccmarl made are replaced.
+fn start_partial(path: &Path, force: bool) -> Result<PathBuf, IoError> {
+    crate::io::refuse_existing(path, force)?;
+    if path.symlink_metadata().is_ok() && !is_ours(path)? {
+        return Err(IoError::Foreign(path.to_owned()));
+    }
+    let partial = crate::io::partial_path(path);
+    crate::io::refuse_existing(&partial, force)?;
+    if partial.is_dir() {
+        std::fs::remove_dir_all(&partial).map_err(IoError::os("remove", &partial))?;
+    } else if partial.symlink_metadata().is_ok() {
+        std::fs::remove_file(&partial).map_err(IoError::os("remove", &partial))?;
+    }
+    crate::io::create_parent(path)?;
+    Ok(partial)
+}
+
+/// Whether ccmarl made what stands at `path`: an empty directory or file, one with a rollout manifest, or a file that
+/// carries our metadata key in its last mebibyte.
+fn is_ours(path: &Path) -> Result<bool, IoError> {
+    use std::io::{Read as _, Seek as _, SeekFrom};
+    if path.is_dir() {
+        if std::fs::read_dir(path).map_err(IoError::os("list", path))?.next().is_none() {
+            return Ok(true);
+        }
+        let manifest = crate::io::read_text(&path.join("manifest.json"), MANIFEST_LIMIT).unwrap_or_default();
+        let json: serde_json::Value = serde_json::from_str(&manifest).unwrap_or_default();
+        return Ok(json["kind"] == "rollouts");
+    }
+    let mut file = std::fs::File::open(path).map_err(IoError::os("open", path))?;
+    let size = file.metadata().map_err(IoError::os("read", path))?.len();
+    let mut tail = Vec::new();
+    file.seek(SeekFrom::Start(size.saturating_sub(1 << 20))).map_err(IoError::os("read", path))?;
+    file.take(1 << 20).read_to_end(&mut tail).map_err(IoError::os("read", path))?;
+    let key = b"ccmarl.manifest";
+    Ok(size == 0 || tail.windows(key.len()).any(|w| w == key))
 }
 
 /// The first format that claims the path; Parquet when none does.

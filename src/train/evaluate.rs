@@ -67,7 +67,7 @@ pub fn evaluate(
 /// [`TrainError`].
 pub fn write_evaluation(dir: &Path, config: &TrainConfig, rows: &[EvaluationRow]) -> Result<(), TrainError> {
     let n = rows.len();
-    let agents = crate::scenario::build(&config.scenario)?.agents().iter().filter(|a| a.learner).count();
+    let agents = scenario::build(&config.scenario)?.agents().iter().filter(|a| a.learner).count();
     let prior = config.prior.as_ref().map(ToString::to_string).unwrap_or_default();
     let text = |name: &str, value: &str| Column::new(name.into(), vec![value; n]);
     let columns = vec![

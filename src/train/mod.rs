@@ -14,7 +14,7 @@ use std::path::PathBuf;
 pub use config::TrainConfig;
 pub use evaluate::{EVALUATION_COLUMNS, EvaluationRow, evaluate, write_evaluation};
 pub use metrics::{METRIC_COLUMNS, MetricsRow};
-pub use run::{Options, Report, Trainer, train};
+pub use run::{Options, Progress, Report, Trainer, train};
 
 /// What can go wrong with a training run.
 #[derive(Debug, thiserror::Error)]

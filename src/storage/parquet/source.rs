@@ -1,0 +1,222 @@
+//! Opening: a directory of parts, or one file. A digest is checked before anything is decoded.
+
+use std::fs::File;
+use std::io::{Read as _, Seek as _, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use parquet::file::metadata::ParquetMetaDataReader;
+use sha2::{Digest as _, Sha256};
+
+use super::decoder::Decoder;
+use super::{FILE_SHA256_KEY, MANIFEST_FILE, MANIFEST_KEY, PART_KEY, find_file_digest};
+use crate::io::{self, IoError};
+use crate::schema::{Episode, Layout, Manifest, SELF_SHA256_PLACEHOLDER, hex};
+use crate::storage::{EpisodeSource, MANIFEST_LIMIT, StorageError, Tally};
+
+/// A directory of parts.
+pub(super) struct Parts {
+    directory: PathBuf,
+    manifest: Manifest,
+    layout: Layout,
+    next_part: usize,
+    /// The open part, and what was read of it.
+    current: Option<(Decoder, Tally)>,
+    total: Tally,
+}
+
+impl Parts {
+    /// Reads the manifest and checks that the parts follow each other and are there.
+    pub(super) fn open(directory: &Path) -> Result<Self, StorageError> {
+        let path = directory.join(MANIFEST_FILE);
+        if !path.exists() {
+            let message = format!("the directory has no {MANIFEST_FILE}: give a directory that `ccmarl record` finished");
+            return Err(StorageError::NotAStore { message, path: directory.to_owned() });
+        }
+        let text = io::read_text(&path, MANIFEST_LIMIT)?;
+        let manifest = parse(&text, &path)?;
+        let mut next = 0;
+        for part in &manifest.parts {
+            let [from, to] = part.episodes;
+            if from != next || to <= from {
+                let message = format!("{}: expected episodes from {next} on, found {from} to {to}", part.file);
+                return Err(StorageError::Damaged { message, path });
+            }
+            next = to;
+            let file = directory.join(&part.file);
+            if !file.is_file() {
+                let message = format!("part {} of episodes {from} to {} is missing: copy the store again", part.file, to - 1);
+                return Err(StorageError::Damaged { message, path: directory.to_owned() });
+            }
+        }
+        if next != manifest.episodes {
+            let message = format!("the parts hold {next} episodes, the manifest says {}", manifest.episodes);
+            return Err(StorageError::Damaged { message, path });
+        }
+        let layout = manifest.layout();
+        Ok(Self { directory: directory.to_owned(), manifest, layout, next_part: 0, current: None, total: Tally::default() })
+    }
+
+    /// Checks the digest of the next part and opens it; false when there is none.
+    fn open_part(&mut self) -> Result<bool, StorageError> {
+        let Some(part) = self.manifest.parts.get(self.next_part) else {
+            return Ok(false);
+        };
+        let path = self.directory.join(&part.file);
+        let size = std::fs::metadata(&path).map_err(IoError::os("read", &path))?.len();
+        let (expected, [from, to]) = (part.bytes, part.episodes);
+        if size < expected {
+            let message = format!("cut short, {size} of {expected} bytes (episodes {from} to {}): copy the store again", to - 1);
+            return Err(StorageError::Damaged { message, path });
+        }
+        let (sha256, bytes) = io::sha256_file(&path)?;
+        if sha256 != part.sha256 || bytes != expected {
+            let message = format!("the bytes changed since it was written (episodes {from} to {}): copy the store again", to - 1);
+            return Err(StorageError::Damaged { message, path });
+        }
+        self.current = Some((Decoder::open(&path, &self.layout)?, Tally::default()));
+        self.next_part += 1;
+        Ok(true)
+    }
+}
+
+impl EpisodeSource for Parts {
+    fn manifest(&self) -> &Manifest {
+        &self.manifest
+    }
+
+    fn next_episode(&mut self) -> Result<Option<Episode>, StorageError> {
+        loop {
+            let Some((decoder, tally)) = &mut self.current else {
+                if self.open_part()? {
+                    continue;
+                }
+                self.total.compare(&self.manifest, &self.directory)?;
+                return Ok(None);
+            };
+            let part = &self.manifest.parts[self.next_part - 1];
+            let path = self.directory.join(&part.file);
+            if let Some(episode) = decoder.next_episode(self.total.episodes)? {
+                let hash = self.total.check(&self.layout, &episode);
+                let hash = hash.map_err(|source| StorageError::Schema { source, path })?;
+                tally.add(&episode, &hash);
+                self.total.add(&episode, &hash);
+                return Ok(Some(episode));
+            }
+            let [from, to] = part.episodes;
+            if tally.episodes != to - from || tally.content() != part.content {
+                let message = format!("expected the {} episodes of the manifest's digest, found others", to - from);
+                return Err(StorageError::Damaged { message, path });
+            }
+            self.current = None;
+        }
+    }
+}
+
+/// One file.
+pub(super) struct Single {
+    path: PathBuf,
+    manifest: Manifest,
+    layout: Layout,
+    decoder: Option<Decoder>,
+    total: Tally,
+}
+
+impl Single {
+    /// Checks the digest of the whole file, then reads its manifest.
+    pub(super) fn open(path: &Path) -> Result<Self, StorageError> {
+        check_file(path)?;
+        let file = File::open(path).map_err(IoError::os("open", path))?;
+        let damaged = |message: String| StorageError::Damaged { message, path: path.to_owned() };
+        let metadata = ParquetMetaDataReader::new().parse_and_finish(&file);
+        let metadata = metadata.map_err(|e| damaged(format!("its footer cannot be read: {e}")))?;
+        let entries = metadata.file_metadata().key_value_metadata();
+        let text = entries.into_iter().flatten().find(|kv| kv.key == MANIFEST_KEY).and_then(|kv| kv.value.as_deref());
+        let manifest = parse(text.ok_or_else(|| damaged(format!("it has no {MANIFEST_KEY}")))?, path)?;
+        let layout = manifest.layout();
+        let rows = u64::try_from(metadata.file_metadata().num_rows()).unwrap_or(0);
+        if manifest.steps.checked_add(manifest.episodes) != Some(rows) {
+            let (episodes, steps) = (manifest.episodes, manifest.steps);
+            return Err(damaged(format!("{episodes} episodes of {steps} steps do not give its {rows} rows")));
+        }
+        let decoder = Some(Decoder::open(path, &layout)?);
+        Ok(Self { path: path.to_owned(), manifest, layout, decoder, total: Tally::default() })
+    }
+}
+
+impl EpisodeSource for Single {
+    fn manifest(&self) -> &Manifest {
+        &self.manifest
+    }
+
+    fn next_episode(&mut self) -> Result<Option<Episode>, StorageError> {
+        let Some(decoder) = &mut self.decoder else { return Ok(None) };
+        if let Some(episode) = decoder.next_episode(self.total.episodes)? {
+            let hash = self.total.check(&self.layout, &episode);
+            let hash = hash.map_err(|source| StorageError::Schema { source, path: self.path.clone() })?;
+            self.total.add(&episode, &hash);
+            return Ok(Some(episode));
+        }
+        self.decoder = None;
+        self.total.compare(&self.manifest, &self.path)?;
+        Ok(None)
+    }
+}
+
+fn parse(text: &str, path: &Path) -> Result<Manifest, StorageError> {
+    Manifest::parse(text).map_err(|source| StorageError::Schema { source, path: path.to_owned() })
+}
+
+/// Checks a single file against the digest that it carries; says what it is when it carries none.
+fn check_file(path: &Path) -> Result<(), StorageError> {
+    let os = |action| IoError::os(action, path);
+    let not = |message: &str| Err(StorageError::NotAStore { message: message.to_owned(), path: path.to_owned() });
+    let mut file = File::open(path).map_err(os("open"))?;
+    let size = file.metadata().map_err(os("read"))?.len();
+    let mut magic = [0; 4];
+    if size < 12 || file.read_exact(&mut magic).is_err() || magic != *b"PAR1" {
+        return not("it does not begin as a Parquet file");
+    }
+    file.seek(SeekFrom::End(-8)).map_err(os("read"))?;
+    let mut end = [0; 8];
+    file.read_exact(&mut end).map_err(os("read"))?;
+    if end[4..] != *b"PAR1" {
+        let message = "cut short, it does not end as a Parquet file: copy it again".to_owned();
+        return Err(StorageError::Damaged { message, path: path.to_owned() });
+    }
+    let footer = u64::from(u32::from_le_bytes([end[0], end[1], end[2], end[3]])).min(size - 8);
+    // The entry stands near the footer's end, so one mebibyte is enough however long a footer claims to be.
+    let tail = (footer + 8).min(1 << 20);
+    file.seek(SeekFrom::Start(size - tail)).map_err(os("read"))?;
+    let mut text = Vec::new();
+    (&file).take(tail).read_to_end(&mut text).map_err(os("read"))?;
+    let Some(at) = find_file_digest(&text) else {
+        let part = text.windows(PART_KEY.len()).any(|w| w == PART_KEY.as_bytes());
+        return not(if part {
+            "it is one part of a directory store: give the directory"
+        } else {
+            "a Parquet file without ccmarl's manifest; for a table use `ccmarl estimate-mi FILE --x … --y …`"
+        });
+    };
+    let digits = size - tail + at as u64;
+    let (mut hash, mut block, mut position) = (Sha256::new(), vec![0; 1 << 18], 0_u64);
+    file.seek(SeekFrom::Start(0)).map_err(os("read"))?;
+    loop {
+        let n = file.read(&mut block).map_err(os("read"))?;
+        if n == 0 {
+            break;
+        }
+        for (i, byte) in SELF_SHA256_PLACEHOLDER.bytes().enumerate() {
+            let offset = (digits + i as u64).wrapping_sub(position);
+            if offset < n as u64 {
+                block[offset as usize] = byte;
+            }
+        }
+        hash.update(&block[..n]);
+        position += n as u64;
+    }
+    if hex(&hash.finalize()).as_bytes() != &text[at..at + 64] {
+        let message = format!("its bytes do not have the digest in its {FILE_SHA256_KEY}: they changed since it was written");
+        return Err(StorageError::Damaged { message, path: path.to_owned() });
+    }
+    Ok(())
+}

@@ -1,0 +1,98 @@
+//! What every container counts and checks alike: episode order, schema, finite numbers, and the digests of content.
+
+use std::path::Path;
+
+use sha2::{Digest as _, Sha256};
+
+use super::StorageError;
+use crate::schema::{Episode, Layout, Manifest, SchemaError, hex};
+
+/// A running count of episodes and steps, and the digest over their content hashes in order.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Tally {
+    /// Episodes so far.
+    pub(super) episodes: u64,
+    /// Steps so far.
+    pub(super) steps: u64,
+    content: Sha256,
+}
+
+impl Tally {
+    /// Checks the next episode of a store and returns its content hash. `self` counts the whole store.
+    pub(super) fn check(&self, layout: &Layout, episode: &Episode) -> Result<[u8; 32], SchemaError> {
+        let value = |column: &str, message: String| SchemaError::Value { column: column.to_owned(), message };
+        if episode.index != self.episodes {
+            let message = format!("expected episode {}, found {}", self.episodes, episode.index);
+            return Err(value("episode", message));
+        }
+        if episode.steps >= i32::MAX as usize {
+            return Err(value("step", format!("{} steps are more than a step number holds", episode.steps)));
+        }
+        episode.check(layout)?;
+        finite(layout, episode)?;
+        Ok(episode.content_hash())
+    }
+
+    /// Counts an episode with this content hash.
+    pub(super) fn add(&mut self, episode: &Episode, hash: &[u8; 32]) {
+        self.episodes += 1;
+        self.steps += episode.steps as u64;
+        self.content.update(hash);
+    }
+
+    /// The digest so far, 64 hex digits.
+    pub(super) fn content(&self) -> String {
+        hex(&self.content.clone().finalize())
+    }
+
+    /// Fills the counts and the digest into the manifest of a recording that ends.
+    pub(super) fn seal(&self, manifest: &mut Manifest, path: &Path) -> Result<(), StorageError> {
+        if self.episodes == 0 {
+            let message = "no episode was recorded, and a store holds at least one".to_owned();
+            return Err(StorageError::NotAStore { message, path: path.to_owned() });
+        }
+        manifest.episodes = self.episodes;
+        manifest.steps = self.steps;
+        manifest.content = self.content();
+        Ok(())
+    }
+
+    /// Compares what was read with what the manifest says.
+    pub(super) fn compare(&self, manifest: &Manifest, path: &Path) -> Result<(), StorageError> {
+        let damaged = |message: String| Err(StorageError::Damaged { message, path: path.to_owned() });
+        if self.episodes != manifest.episodes {
+            return damaged(format!("expected {} episodes, found {}", manifest.episodes, self.episodes));
+        }
+        if self.steps != manifest.steps {
+            return damaged(format!("expected {} steps, found {}", manifest.steps, self.steps));
+        }
+        if self.content() != manifest.content {
+            return damaged("the episodes do not have the content digest of the manifest".to_owned());
+        }
+        Ok(())
+    }
+}
+
+/// Refuses NaN and infinities: no sum or estimate over them would mean anything.
+fn finite(layout: &Layout, e: &Episode) -> Result<(), SchemaError> {
+    let fail = |column: String, width: usize, at: usize, value: f64| {
+        let (step, element) = (at / width.max(1), at % width.max(1));
+        let message = format!("step {step}, element {element}: found {value}, but a store holds finite numbers only");
+        Err(SchemaError::Value { column, message })
+    };
+    if let Some(at) = e.state.iter().position(|v| !v.is_finite()) {
+        return fail("state".to_owned(), layout.state_fields.len(), at, e.state[at]);
+    }
+    let check = |kind: &str, agent: &str, width: usize, data: &[f32]| match data.iter().position(|v| !v.is_finite()) {
+        Some(at) => fail(format!("{kind}{agent}"), width, at, f64::from(data[at])),
+        None => Ok(()),
+    };
+    check("reward", "", 1, &e.reward)?;
+    for (i, a) in layout.agents.iter().enumerate() {
+        check("observation.", &a.name, a.observation, &e.observations[i].data)?;
+        check("message.", &a.name, a.message, &e.messages[i].data)?;
+        check("action.", &a.name, a.action, &e.actions[i].data)?;
+        check("reward.", &a.name, 1, &e.rewards[i])?;
+    }
+    Ok(())
+}

@@ -1,0 +1,80 @@
+//! Benchmarks of the core: stepping worlds, rolling out episodes, one update of the learner.
+#![expect(missing_docs, reason = "criterion's macros make undocumented items")]
+
+use std::hint::black_box;
+use std::path::Path;
+
+use ccmarl::link::{self, Setting};
+use ccmarl::record::{self, Recording};
+use ccmarl::registry::Spec;
+use ccmarl::rng::Seeds;
+use ccmarl::scenario;
+use ccmarl::train::{TrainConfig, Trainer};
+use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+
+fn steps(c: &mut Criterion) {
+    let mut group = c.benchmark_group("env step");
+    group.throughput(Throughput::Elements(1000));
+    for name in ["simple_spread", "simple_tag"] {
+        let scenario = scenario::build(&Spec::new(name)).unwrap();
+        let (mut world, mut rng) = (scenario.world(), Seeds::new(1).stream("bench"));
+        let mut actions = vec![0.3f32; scenario.agents().iter().map(|a| a.action).sum()];
+        let mut rewards = vec![0.0; scenario.agents().len()];
+        scenario.reset(&mut world, &mut rng);
+        group.bench_function(name, |b| {
+            b.iter(|| {
+                for _ in 0..1000 {
+                    scenario.scripted(&world, &mut rng, &mut actions);
+                    black_box(scenario.step(&mut world, &actions, &mut rewards));
+                }
+            });
+        });
+    }
+}
+
+fn episodes(c: &mut Criterion) {
+    let mut group = c.benchmark_group("episode, steps");
+    group.throughput(Throughput::Elements(25));
+    for name in ["simple_spread", "simple_tag"] {
+        let scenario = scenario::build(&Spec::new(name)).unwrap();
+        let setting = Setting { distance_unit: scenario.link_unit() };
+        let link = link::build(&Spec::new("dropout").with("p", 0.2), &setting).unwrap();
+        let policy = record::build_policy(&Spec::new("random"), scenario.as_ref()).unwrap();
+        let recording = Recording {
+            scenario: scenario.as_ref(),
+            link: link.as_ref(),
+            policy: policy.as_ref(),
+            seed: 1,
+            episodes: 1,
+        };
+        let mut index = 0;
+        group.bench_function(name, |b| {
+            b.iter(|| {
+                index += 1;
+                recording.episode(index)
+            });
+        });
+    }
+}
+
+/// 100 environment steps and one update, as in training; the difference between rows is the algorithm's.
+fn updates(c: &mut Criterion) {
+    let mut group = c.benchmark_group("100 steps and one update");
+    for algorithm in ["maddpg", "fc-maddpg", "cc-maddpg"] {
+        let config = TrainConfig::new(Spec::new("simple_spread"), algorithm).resolve().unwrap();
+        let mut trainer = Trainer::new(config, Path::new("unused")).unwrap();
+        for _ in 0..400 {
+            trainer.advance(None).unwrap();
+        }
+        group.bench_function(algorithm, |b| {
+            b.iter(|| {
+                for _ in 0..4 {
+                    trainer.advance(None).unwrap();
+                }
+            });
+        });
+    }
+}
+
+criterion_group!(benches, steps, episodes, updates);
+criterion_main!(benches);
