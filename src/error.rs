@@ -5,6 +5,7 @@ use crate::mi::MiError;
 use crate::pairs::PairsError;
 use crate::record::RecordError;
 use crate::registry::RegistryError;
+use crate::report::ReportError;
 use crate::schema::SchemaError;
 use crate::storage::StorageError;
 use crate::train::TrainError;
@@ -36,6 +37,9 @@ pub enum Error {
     /// Training and evaluation.
     #[error(transparent)]
     Train(#[from] TrainError),
+    /// A report.
+    #[error(transparent)]
+    Report(#[from] ReportError),
 }
 
 impl Error {
@@ -44,9 +48,10 @@ impl Error {
         let exists = |e: &IoError| matches!(e, IoError::Exists(_));
         match self {
             Self::Pairs(error) => error.is_usage(),
-            Self::Registry(_) | Self::Record(RecordError::NoEpisodes) => true,
+            Self::Registry(_) | Self::Record(RecordError::NoEpisodes) | Self::Report(ReportError::NoInput) => true,
             Self::Train(TrainError::Registry(_) | TrainError::Config { .. } | TrainError::Value { .. }) => true,
-            Self::Io(e) | Self::Storage(StorageError::Io(e)) | Self::Train(TrainError::Io(e)) => exists(e),
+            Self::Io(e) | Self::Report(ReportError::Io(e)) => exists(e),
+            Self::Storage(StorageError::Io(e)) | Self::Train(TrainError::Io(e)) => exists(e),
             _ => false,
         }
     }
