@@ -17,6 +17,7 @@ const KINDS: &[(&str, fn(&'static str) -> Vec<Listed>)] = &[
     ("format", |kind| listed(kind, crate::storage::FORMATS)),
     ("estimator", |kind| listed(kind, crate::mi::ESTIMATORS)),
     ("algorithm", |kind| listed(kind, crate::algo::ALGORITHMS)),
+    ("figure", |kind| listed(kind, crate::figure::FIGURES)),
     ("suite", suites),
     ("channel", channels),
 ];
