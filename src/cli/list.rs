@@ -9,8 +9,11 @@ use super::ui::{self, Format};
 use crate::link;
 use crate::registry::Entry;
 
+/// Lists the entries of a kind.
+type List = fn(&'static str) -> Vec<Listed>;
+
 /// The registries: a kind's name and its entries. A new registry is one line here.
-const KINDS: &[(&str, fn(&'static str) -> Vec<Listed>)] = &[
+const KINDS: &[(&str, List)] = &[
     ("scenario", |kind| listed(kind, crate::scenario::SCENARIOS)),
     ("link", |kind| listed(kind, link::LINKS)),
     ("policy", |kind| listed(kind, crate::record::POLICIES)),

@@ -49,7 +49,7 @@ enum Command {
     /// Test a trained team on every channel of a suite
     Evaluate(evaluate::Args),
     /// Render runs as figures, tables and one page
-    Report(report::Args),
+    Report(report::ReportArgs),
     /// List what can be named on the command line: scenarios, links, policies, estimators, algorithms, …
     List(list::Args),
     /// Generate shell completions or manual pages
