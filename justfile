@@ -42,7 +42,6 @@ deny:
 tables:
     python3 datasets/tables/make.py
 
-# The stores in other people's readers (needs python3 with pyarrow, polars, duckdb and mcap)
+# The stores in other people's readers: pyarrow, polars, duckdb, mcap (needs python3 with venv, and PyPI)
 interop:
-    cargo build --locked --release
-    for script in tests/interop/*.py; do echo "$script"; python3 "$script"; done
+    tests/interop/run.sh

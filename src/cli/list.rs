@@ -6,14 +6,23 @@ use serde::Serialize;
 
 use super::Outcome;
 use super::ui::{self, Format};
+use crate::link;
 use crate::registry::Entry;
 
+/// Lists the entries of a kind.
+type List = fn(&'static str) -> Vec<Listed>;
+
 /// The registries: a kind's name and its entries. A new registry is one line here.
-const KINDS: &[(&str, fn(&'static str) -> Vec<Listed>)] = &[
+const KINDS: &[(&str, List)] = &[
     ("scenario", |kind| listed(kind, crate::scenario::SCENARIOS)),
-    ("link", |kind| listed(kind, crate::link::LINKS)),
+    ("link", |kind| listed(kind, link::LINKS)),
     ("policy", |kind| listed(kind, crate::record::POLICIES)),
     ("format", |kind| listed(kind, crate::storage::FORMATS)),
+    ("estimator", |kind| listed(kind, crate::mi::ESTIMATORS)),
+    ("algorithm", |kind| listed(kind, crate::algo::ALGORITHMS)),
+    ("figure", |kind| listed(kind, crate::figure::FIGURES)),
+    ("suite", suites),
+    ("channel", channels),
 ];
 
 /// One plugin as `list` prints it.
@@ -23,7 +32,7 @@ struct Listed {
     name: &'static str,
     /// What stands on the command line: `name` or `name:value`.
     syntax: String,
-    summary: &'static str,
+    summary: String,
     reference: &'static str,
 }
 
@@ -46,7 +55,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     match args.format {
         Format::Json => ui::print_json(&all)?,
         Format::Table => {
-            let cells = |p: &Listed| [p.kind, &p.syntax, p.summary, p.reference].map(ToOwned::to_owned).to_vec();
+            let cells = |p: &Listed| [p.kind, &p.syntax, &p.summary, p.reference].map(ToOwned::to_owned).to_vec();
             ui::print_table(&["kind", "name", "what it is", "reference"], &all.iter().map(cells).collect::<Vec<_>>())?;
         }
     }
@@ -55,10 +64,33 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
 
 /// The entries of one registry.
 fn listed<B>(kind: &'static str, entries: &[Entry<B>]) -> Vec<Listed> {
-    let syntax = |e: &Entry<B>| e.value.map_or_else(|| e.name.to_owned(), |value| format!("{}:{value}", e.name));
-    let list =
-        |e: &Entry<B>| Listed { kind, name: e.name, syntax: syntax(e), summary: e.summary, reference: e.reference };
+    let list = |e: &Entry<B>| Listed {
+        kind,
+        name: e.name,
+        syntax: e.value.map_or_else(|| e.name.to_owned(), |value| format!("{}:{value}", e.name)),
+        summary: e.summary.to_owned(),
+        reference: e.reference,
+    };
     entries.iter().map(list).collect()
+}
+
+/// The suites of test channels.
+fn suites(kind: &'static str) -> Vec<Listed> {
+    let row = |suite: &&'static str| {
+        let ids: Vec<_> = link::suite(suite).into_iter().flatten().map(|channel| channel.id).collect();
+        tested(kind, suite, format!("the channels {}", ids.join(", ")))
+    };
+    link::SUITES.iter().map(row).collect()
+}
+
+/// The test channels of all suites.
+fn channels(kind: &'static str) -> Vec<Listed> {
+    let all = link::SUITES.iter().flat_map(|suite| link::suite(suite).into_iter().flatten());
+    all.map(|channel| tested(kind, channel.id, format!("the link {} as test channel", channel.spec))).collect()
+}
+
+fn tested(kind: &'static str, name: &'static str, summary: String) -> Listed {
+    Listed { kind, name, syntax: name.to_owned(), summary, reference: "arXiv 2512.03528, experiments" }
 }
 
 #[cfg(test)]

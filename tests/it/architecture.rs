@@ -1,7 +1,6 @@
 //! Holds the house of ARCHITECTURE.md: who may import whom, which crate belongs to which room, how a plugin file
 //! begins and is listed, how long a file may be. Reads the sources as text.
 
-use std::fmt::Write as _;
 use std::path::Path;
 
 /// Rooms by floor, bottom up. A room imports from floors below its own.
@@ -116,7 +115,7 @@ fn without_literals(text: &str) -> String {
     };
     while i < chars.len() {
         let word_before = i > 0 && (at(i - 1).is_alphanumeric() || at(i - 1) == '_');
-        let hashes = (i + 1..).take_while(|&k| at(k) == '#').count();
+        let hashes = (i + 1..chars.len()).take_while(|&k| at(k) == '#').count();
         if starts(i, "//") {
             i += (i..chars.len()).take_while(|&k| at(k) != '\n').count();
         } else if starts(i, "/*") {
@@ -311,9 +310,9 @@ fn plugin_faults(sources: &[Source]) -> Vec<String> {
             }
             let found = headings(&plugin.text);
             if found != HEADINGS {
-                let mut wanted = String::new();
-                HEADINGS.iter().for_each(|h| write!(wanted, "\n  //! {h}").unwrap());
-                faults.push(format!("src/{path}: begin with exactly these headings:{wanted}\n  found {found:?}"));
+                let wanted = HEADINGS.join("\n  //! ");
+                faults
+                    .push(format!("src/{path}: begin with exactly these headings:\n  //! {wanted}\n  found {found:?}"));
             }
         }
         for name in listed.iter().filter(|name| !plugins.iter().any(|p| p.module() == **name)) {
@@ -420,7 +419,7 @@ fn the_scanner_sees_crates_and_words_out_of_place() {
 
 #[test]
 fn the_scanner_sees_unlisted_and_undocumented_plugins() {
-    let doc = HEADINGS.iter().map(|h| format!("//! {h}\n//!\n//! Words.\n//!\n")).collect::<String>();
+    let doc = format!("//! {}\n//!\n//! Words.\n", HEADINGS.join("\n//!\n//! Words.\n//!\n//! "));
     let plugin = format!("{doc}\npub(super) const ENTRY: Entry<Build> = x;\n");
     let list = |code: &str| Source::new("link/mod.rs", code);
     let good = [list("const LINKS: &[Entry<Build>] = &[dropout::ENTRY];"), Source::new("link/dropout.rs", &plugin)];

@@ -45,6 +45,32 @@ fn usage_faults_exit_2_and_name_the_nearest() {
 }
 
 #[test]
+fn unknown_plugins_exit_2_and_name_the_nearest_wherever_they_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    for (words, fault) in [
+        ("record --scenario simple_tga", "unknown scenario \"simple_tga\": did you mean simple_tag"),
+        ("record --scenario simple_tag --link dropuot:0.2", "unknown link \"dropuot\": did you mean dropout?"),
+        ("record --scenario simple_tag --policy prob:0.5", "unknown policy \"prob\": did you mean probe?"),
+        (
+            "train --scenario simple_spread --algorithm cc-madpg",
+            "unknown algorithm \"cc-madpg\": did you mean cc-maddpg",
+        ),
+        (
+            "estimate-mi datasets/tables/iris.csv --x a --y b --estimator gausian",
+            "unknown estimator \"gausian\": did you mean",
+        ),
+    ] {
+        let mut args: Vec<&str> = words.split(' ').collect();
+        args.extend(["--out", out.to_str().unwrap()]);
+        let (code, stdout, err) = run(&args);
+        assert_eq!((code, stdout.as_str()), (2, ""), "{words}: {err}");
+        assert!(err.starts_with(&format!("error: {fault}")) && err.lines().count() == 1, "{words}: {err}");
+        assert!(!out.exists(), "{words} left something behind");
+    }
+}
+
+#[test]
 fn a_reader_that_leaves_is_no_error() {
     for args in [&["--help"][..], &["list"], &["list", "--format", "json"], &["generate", "completions", "bash"]] {
         let mut process = Process::new(env!("CARGO_BIN_EXE_ccmarl"));
@@ -95,11 +121,8 @@ fn completions_and_manual_pages_name_every_subcommand() {
     let man = ["generate", "man", "--out", out.to_str().unwrap()];
     assert_eq!(run(&man).0, 0);
     for command in Cli::command().get_subcommands() {
-        assert!(
-            script.contains(&format!("ccmarl__{}", command.get_name().replace('-', "__"))),
-            "{}",
-            command.get_name()
-        );
+        let case = format!("ccmarl,{})", command.get_name());
+        assert!(script.contains(&case), "no {case} in the script");
         let page = std::fs::read_to_string(out.join(format!("ccmarl-{}.1", command.get_name()))).unwrap();
         assert!(page.contains(".SH SYNOPSIS"), "{page}");
     }
