@@ -1,8 +1,11 @@
 //! The crate's error: one enum per room, wrapped here, and the exit code each deserves.
 
 use crate::io::IoError;
+use crate::mi::MiError;
+use crate::pairs::PairsError;
 use crate::record::RecordError;
 use crate::registry::RegistryError;
+use crate::report::ReportError;
 use crate::schema::SchemaError;
 use crate::storage::StorageError;
 use crate::train::TrainError;
@@ -16,6 +19,12 @@ pub enum Error {
     /// A plugin's name or parameters.
     #[error(transparent)]
     Registry(#[from] RegistryError),
+    /// Samples from a store or a table.
+    #[error(transparent)]
+    Pairs(#[from] PairsError),
+    /// Samples that cannot carry an estimate.
+    #[error(transparent)]
+    Mi(#[from] MiError),
     /// Recording.
     #[error(transparent)]
     Record(#[from] RecordError),
@@ -28,6 +37,9 @@ pub enum Error {
     /// Training and evaluation.
     #[error(transparent)]
     Train(#[from] TrainError),
+    /// A report.
+    #[error(transparent)]
+    Report(#[from] ReportError),
 }
 
 impl Error {
@@ -35,9 +47,11 @@ impl Error {
     pub fn is_usage(&self) -> bool {
         let exists = |e: &IoError| matches!(e, IoError::Exists(_));
         match self {
-            Self::Registry(_) | Self::Record(RecordError::NoEpisodes) => true,
+            Self::Pairs(error) => error.is_usage(),
+            Self::Registry(_) | Self::Record(RecordError::NoEpisodes) | Self::Report(ReportError::NoInput) => true,
             Self::Train(TrainError::Registry(_) | TrainError::Config { .. } | TrainError::Value { .. }) => true,
-            Self::Io(e) | Self::Storage(StorageError::Io(e)) | Self::Train(TrainError::Io(e)) => exists(e),
+            Self::Io(e) | Self::Report(ReportError::Io(e)) => exists(e),
+            Self::Storage(StorageError::Io(e)) | Self::Train(TrainError::Io(e)) => exists(e),
             _ => false,
         }
     }

@@ -2,9 +2,14 @@
 #![expect(clippy::print_stdout, clippy::print_stderr, reason = "the face of the program prints")]
 
 mod args;
+mod estimate_mi;
 mod evaluate;
+mod generate;
 mod inspect;
+mod list;
+mod quickstart;
 mod record;
+mod report;
 mod train;
 mod ui;
 
@@ -31,14 +36,24 @@ pub struct Cli {
 /// The subcommands.
 #[derive(Debug, Subcommand)]
 enum Command {
+    /// Run the whole line once: train, record, estimate, test, report
+    Quickstart(quickstart::Args),
     /// Record episodes of a scenario under a policy and a link
     Record(record::Args),
+    /// Show what a recorded store holds
+    Inspect(inspect::Args),
+    /// Estimate how much messages and actions, or any columns, tell about each other
+    EstimateMi(estimate_mi::Args),
     /// Train a team over a link prior
     Train(train::Args),
     /// Test a trained team on every channel of a suite
     Evaluate(evaluate::Args),
-    /// Show what a recorded store holds
-    Inspect(inspect::Args),
+    /// Render runs as figures, tables and one page
+    Report(report::ReportArgs),
+    /// List what can be named on the command line: scenarios, links, policies, estimators, algorithms, …
+    List(list::Args),
+    /// Generate shell completions or manual pages
+    Generate(generate::Args),
 }
 
 /// How a command ended, when it did not fail.
@@ -72,9 +87,14 @@ pub fn main() -> ExitCode {
 
 fn dispatch(command: Command) -> anyhow::Result<Outcome> {
     match command {
+        Command::Quickstart(args) => quickstart::run(&args),
         Command::Record(args) => record::run(&args),
+        Command::Inspect(args) => inspect::run(&args),
+        Command::EstimateMi(args) => estimate_mi::run(&args),
         Command::Train(args) => train::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
-        Command::Inspect(args) => inspect::run(&args),
+        Command::Report(args) => report::run(&args),
+        Command::List(args) => list::run(&args),
+        Command::Generate(args) => generate::run(&args),
     }
 }

@@ -1,8 +1,100 @@
-//! Mutual information.
+//! Mutual information: estimators, the protocol that keeps them honest, and the pieces that the trainer shares.
+//!
+//! Three scales, never mixed. J = E\[−sp(−T)\] − E\[sp(T)\] ∈ \[−2 ln 2, 0\] is what the paper prints; shifted, J + 2 ln 2 =
+//! 2·JSD ∈ \[0, 2 ln 2\], has the unit `jsd` here; everything else is in nats.
+//!
+//! Adding an estimator: write `mi/<name>.rs` with an `ENTRY`, and add `mod <name>;` and `<name>::ENTRY,` below. The
+//! rest of the room is protocol: `split` and `prepare` (by episode), `fit` (training, stopped on validation),
+//! `interval` (episodes as blocks), `null` (whole episodes permuted), `run` (all jobs in parallel).
 
+mod club;
 pub mod conditional;
 pub mod critic;
+mod estimate;
+mod fit;
+mod gaussian;
+mod interval;
+mod jsd;
+mod linear;
 pub mod losses;
 mod negatives;
+mod null;
+mod prepare;
+mod run;
 
+pub use estimate::{Estimate, Kind, Unit, to_csv, to_json, to_parquet};
+pub use interval::{Interval, block_interval};
+pub use jsd::certified;
 pub use negatives::{all_others, derangements};
+pub use null::{p_value, permuted_rows};
+pub use run::{Job, JobResult, Plan, run};
+
+use crate::registry::{Entry, RegistryError, Spec};
+use crate::rng::Seeds;
+use crate::schema::Samples;
+
+/// All estimators.
+pub const ESTIMATORS: &[Entry<Build>] = &[club::ENTRY, gaussian::ENTRY, jsd::ENTRY];
+
+/// Makes an estimator from its parameters.
+pub type Build = fn(&Spec) -> Result<Box<dyn Estimator>, RegistryError>;
+
+/// Estimates the mutual information of one set of samples.
+pub trait Estimator: Send + Sync {
+    /// The estimate, and what comes with it, as output rows. All randomness comes from `seeds`.
+    ///
+    /// # Errors
+    /// [`MiError`] when the samples cannot carry the estimate.
+    fn estimate(&self, samples: &Samples, protocol: &Protocol, seeds: &Seeds) -> Result<Vec<Estimate>, MiError>;
+}
+
+/// What all estimators hold to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Protocol {
+    /// Permutations behind a p-value; 0: no p-value.
+    pub permutations: usize,
+}
+
+impl Default for Protocol {
+    fn default() -> Self {
+        Self { permutations: 199 }
+    }
+}
+
+/// Why samples cannot carry an estimate.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+pub enum MiError {
+    /// Training, validation and test need episodes of their own.
+    #[error(
+        "needs at least {needed} episodes to split by episode into training, validation and test, found {found}: \
+         record more, or give --group a column with more values"
+    )]
+    TooFewEpisodes {
+        /// Least number.
+        needed: usize,
+        /// Number with samples.
+        found: usize,
+    },
+    /// Too few samples for the widths.
+    #[error("needs at least {needed} samples for {widths} columns, found {found}: add samples or name fewer columns")]
+    TooFewSamples {
+        /// Least number.
+        needed: usize,
+        /// Columns of x and y.
+        widths: usize,
+        /// Number found.
+        found: usize,
+    },
+    /// All of x, or all of y, is one value.
+    #[error("{column} is constant, so it can tell nothing: name another column")]
+    Constant {
+        /// Which columns.
+        column: String,
+    },
+    /// Training went astray.
+    #[error("training did not give a finite value: look for extreme values in {columns}")]
+    Diverged {
+        /// Which columns.
+        columns: String,
+    },
+}

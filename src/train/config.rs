@@ -197,7 +197,13 @@ impl TrainConfig {
     pub fn resolve(mut self) -> Result<Self, TrainError> {
         let preset = algo::preset(&self.algorithm)?;
         env!("CARGO_PKG_VERSION").clone_into(&mut self.ccmarl);
-        self.scenario = resolved(crate::scenario::build(&self.scenario)?.parameters());
+        let parameters = crate::scenario::build(&self.scenario)?.parameters();
+        self.scenario = resolved(parameters.clone());
+        let again = crate::scenario::build(&self.scenario)?.parameters();
+        if let Some((key, _)) = parameters.iter().find(|(key, value)| again.get(*key) != Some(*value)) {
+            let message = "null cannot be written in TOML; give a number (a radius of 1000 sees everything)".to_owned();
+            return Err(TrainError::Value { name: format!("scenario.{key}"), message });
+        }
         let prior = self.prior.take().unwrap_or(preset.prior);
         let setting = crate::link::Setting { distance_unit: crate::scenario::build(&self.scenario)?.link_unit() };
         self.prior = Some(resolved(crate::link::build(&prior, &setting)?.parameters()));

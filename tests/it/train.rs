@@ -138,6 +138,10 @@ fn configurations_are_refused_with_their_line_or_their_name() {
     assert_eq!(range, "maddpg.gamma: expected a value in [0, 1], found 1.5");
     let name = read("algorithm = \"madpg\"\nscenario = { name = \"simple_spread\" }\n").unwrap_err();
     assert!(name.contains("unknown algorithm \"madpg\": did you mean maddpg"), "{name}");
+    let mut blind = config("maddpg", 500);
+    blind.scenario = blind.scenario.with("view_radius", serde_json::Value::Null);
+    let null = blind.resolve().unwrap_err().to_string();
+    assert!(null.starts_with("scenario.view_radius: null cannot be written in TOML"), "{null}");
     let scenario = read("algorithm = \"maddpg\"\nscenario = { name = \"simple_spread\", agnets = 3 }\n").unwrap_err();
     assert!(scenario.contains("unknown field `agnets`"), "{scenario}");
 }

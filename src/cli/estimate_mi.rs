@@ -1,0 +1,242 @@
+//! `ccmarl estimate-mi`: mutual information per link of a store, or between columns of a table.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use clap::ValueHint;
+
+use super::Outcome;
+use super::ui::{self, Format};
+use crate::Error;
+use crate::mi::{self, ESTIMATORS, Estimate, Job, JobResult, Kind, Plan, Protocol, Unit};
+use crate::pairs::{self, PairsError, TableOptions};
+use crate::registry::{Spec, find};
+use crate::schema::{SampleLabels, Samples};
+use crate::{io, storage};
+
+const EXAMPLES: &str = "\
+Examples:
+  ccmarl estimate-mi data/tag
+  ccmarl estimate-mi data/tag.mcap --estimator jsd,club,gaussian --delivered
+  ccmarl estimate-mi table.parquet --x a,b --y c --estimator gaussian,jsd --group subject
+  ccmarl estimate-mi table.csv --x a --y b --time t --out result.json
+
+For a store: x is the message that the sender sent, y the action of the receiver at the same step, per ordered link,
+delivered and lost apart. Values are in nats unless the unit says jsd. p: episodes permuted.";
+
+/// Arguments of `ccmarl estimate-mi`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
+pub(super) struct Args {
+    /// A rollout store (directory, .mcap or .parquet), or with --x and --y any CSV or Parquet table
+    #[arg(value_name = "PATH", value_hint = ValueHint::AnyPath)]
+    path: PathBuf,
+    /// Estimators, comma-separated: club, gaussian, jsd (`ccmarl list` describes them)
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', default_value = "jsd,club,gaussian")]
+    estimator: Vec<String>,
+    /// Table: columns of x, comma-separated
+    #[arg(long, value_name = "COLUMNS", value_delimiter = ',', requires = "y")]
+    x: Vec<String>,
+    /// Table: columns of y, comma-separated
+    #[arg(long, value_name = "COLUMNS", value_delimiter = ',', requires = "x")]
+    y: Vec<String>,
+    /// Table: rows with the same value in this column are one episode
+    #[arg(long, value_name = "COLUMN", requires = "x")]
+    group: Option<String>,
+    /// Table: column that orders the rows; without --group all rows are one series, cut into blocks
+    #[arg(long, value_name = "COLUMN", requires = "x")]
+    time: Option<String>,
+    /// Store: delivered messages only
+    #[arg(long, conflicts_with_all = ["lost", "x"])]
+    delivered: bool,
+    /// Store: lost messages only
+    #[arg(long, conflicts_with = "x")]
+    lost: bool,
+    /// Permutations behind a p-value; 0 for none
+    #[arg(long, value_name = "N", default_value_t = 199, value_parser = clap::value_parser!(u32).range(0..=100_000))]
+    permutations: u32,
+    /// Seed of splits, training and permutations
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
+    /// Threads; 0 for one per core (the result does not depend on it)
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u16).range(0..=1024))]
+    threads: u16,
+    /// How results are printed
+    #[arg(long, value_enum, default_value_t)]
+    format: Format,
+    /// Also write the rows to a .json, .csv or .parquet file
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    out: Option<PathBuf>,
+    /// Replace --out if it exists
+    #[arg(long, requires = "out")]
+    force: bool,
+    /// End with exit code 1 if any row carries a warning
+    #[arg(long)]
+    strict: bool,
+}
+
+/// A form of output file.
+type Write = fn(&[Estimate]) -> Result<Vec<u8>, String>;
+
+pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    let plan = plan(args)?;
+    let write = args.out.as_deref().map(|path| writer(path, args.force)).transpose()?;
+    let samples = samples(args)?;
+    let threads = usize::from(args.threads);
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().context("could not start threads")?;
+    let bar = ui::progress((samples.len() * plan.estimators.len()) as u64, "estimating");
+    let results = pool.install(|| mi::run(&samples, &plan, &|| bar.inc(1)));
+    bar.finish_and_clear();
+    let (rows, failures) = split(results)?;
+    if let (Some(path), Some(write)) = (&args.out, write) {
+        let bytes = write(&rows).map_err(anyhow::Error::msg)?;
+        io::write_atomic(path, &bytes).map_err(Error::from)?;
+        ui::say(&format!("wrote {} rows: {}", rows.len(), path.display()));
+    }
+    match args.format {
+        Format::Json => ui::print_json(&rows)?,
+        Format::Table => print(&rows, &samples)?,
+    }
+    for (job, error) in &failures {
+        ui::say(&format!("warning: no {} for {}: {error}", job.estimator, place(&job.labels)));
+    }
+    let warned = rows.iter().filter(|r| !r.warnings.is_empty()).count() + failures.len();
+    anyhow::ensure!(!args.strict || warned == 0, "{warned} results carry warnings, and --strict was given");
+    Ok(Outcome::Done)
+}
+
+fn plan(args: &Args) -> Result<Plan, Error> {
+    let mut estimators = Vec::new();
+    for text in &args.estimator {
+        let spec = Spec::parse("estimator", ESTIMATORS, text)?;
+        let entry = find("estimator", ESTIMATORS, &spec.name)?;
+        if !estimators.iter().any(|(name, _)| *name == spec.to_string()) {
+            estimators.push((spec.to_string(), (entry.build)(&spec)?));
+        }
+    }
+    Ok(Plan { estimators, protocol: Protocol { permutations: args.permutations as usize }, seed: args.seed })
+}
+
+fn writer(path: &Path, force: bool) -> anyhow::Result<Write> {
+    io::refuse_existing(path, force).map_err(Error::from)?;
+    let forms: [(&str, Write); 3] = [("json", mi::to_json), ("csv", mi::to_csv), ("parquet", mi::to_parquet)];
+    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+    let form = forms.iter().find(|(name, _)| extension.as_deref() == Some(*name));
+    form.map(|(_, write)| *write).with_context(|| {
+        format!("--out: expected a name that ends in .json, .csv or .parquet, found {}", path.display())
+    })
+}
+
+fn samples(args: &Args) -> Result<Vec<Samples>, Error> {
+    let path = &args.path;
+    if !args.x.is_empty() {
+        let options =
+            TableOptions { x: args.x.clone(), y: args.y.clone(), group: args.group.clone(), time: args.time.clone() };
+        return Ok(vec![pairs::table(path, &options)?]);
+    }
+    if !pairs::is_store(path)? {
+        return Err(PairsError::NoColumns(path.clone()).into());
+    }
+    let mut source = storage::open(path)?;
+    let mut sets = pairs::links(source.as_mut())?;
+    for (delivered, unwanted) in [(true, args.lost), (false, args.delivered)] {
+        sets.retain(|s| !unwanted || s.labels.delivered != Some(delivered));
+        if !unwanted && !sets.iter().any(|s| s.labels.delivered == Some(delivered)) {
+            ui::say(&format!("note: the store holds no {} message", class(delivered)));
+        }
+    }
+    Ok(sets)
+}
+
+/// All rows, and the jobs that gave none; an error when no job gave any.
+fn split(results: Vec<JobResult>) -> Result<(Vec<Estimate>, Vec<(Job, mi::MiError)>), Error> {
+    let (mut rows, mut failures) = (Vec::new(), Vec::new());
+    for JobResult { job, rows: result } in results {
+        match result {
+            Ok(found) => rows.extend(found),
+            Err(error) => failures.push((job, error)),
+        }
+    }
+    match failures.pop() {
+        Some((_, error)) if rows.is_empty() => Err(error.into()),
+        last => {
+            failures.extend(last);
+            Ok((rows, failures))
+        }
+    }
+}
+
+fn class(delivered: bool) -> &'static str {
+    if delivered { "delivered" } else { "lost" }
+}
+
+/// `agent_0 → agent_1 delivered`, or `a,b → c`.
+fn place(labels: &SampleLabels) -> String {
+    match (&labels.sender, &labels.receiver, labels.delivered) {
+        (Some(sender), Some(receiver), Some(delivered)) => format!("{sender} → {receiver} {}", class(delivered)),
+        _ => format!("{} ; {}", labels.x, labels.y),
+    }
+}
+
+/// Four decimals, and no minus sign before a zero.
+fn decimals(value: f64) -> String {
+    let text = format!("{value:.4}");
+    if text == "-0.0000" { "0.0000".to_owned() } else { text }
+}
+
+fn print(rows: &[Estimate], samples: &[Samples]) -> anyhow::Result<()> {
+    let mut warnings: BTreeMap<&str, Vec<String>> = BTreeMap::new();
+    let mut lines = Vec::new();
+    let mut places = rows.iter().map(|row| {
+        samples
+            .iter()
+            .map(|s| &s.labels)
+            .find(|l| (&l.sender, &l.receiver, l.delivered) == (&row.sender, &row.receiver, row.delivered))
+    });
+    let mut before = String::new();
+    for row in rows {
+        let here = places.next().flatten().map(place).unwrap_or_default();
+        let sign = match row.kind {
+            Kind::LowerBound => "≥ ",
+            Kind::UpperBound => "≤ ",
+            Kind::Estimate => "",
+        };
+        let value = if row.value.is_infinite() {
+            "infinite (copy)".to_owned()
+        } else {
+            format!("{sign}{}", decimals(row.value))
+        };
+        let interval = row.interval_low.zip(row.interval_high);
+        lines.push(vec![
+            if here == before { String::new() } else { here.clone() },
+            row.estimator.clone(),
+            value,
+            interval.map_or_else(String::new, |(low, high)| format!("{} … {}", decimals(low), decimals(high))),
+            match row.unit {
+                Unit::Nats => "nats".to_owned(),
+                Unit::Jsd => "jsd".to_owned(),
+            },
+            row.p_value.map_or_else(String::new, |p| format!("{p:.3}")),
+            row.n.to_string(),
+            format!("{:.0}", row.n_effective),
+        ]);
+        for warning in &row.warnings {
+            let named = warnings.entry(warning).or_default();
+            if !named.contains(&here) {
+                named.push(here.clone());
+            }
+        }
+        before = here;
+    }
+    ui::print_table(&["samples", "estimator", "value", "95 % interval", "unit", "p", "n", "n_eff"], &lines)?;
+    if samples.iter().any(|s| s.labels.group == "row") {
+        ui::print("each row was taken as independent; give --group or --time if rows belong together")?;
+    }
+    for (warning, places) in warnings {
+        let shown = places.iter().take(3).map(String::as_str).collect::<Vec<_>>().join(", ");
+        let more = if places.len() > 3 { format!(" and {} more", places.len() - 3) } else { String::new() };
+        ui::print(&format!("warning: {} ({}{more})", io::printable(warning), io::printable(&shown)))?;
+    }
+    Ok(())
+}

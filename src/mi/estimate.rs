@@ -1,0 +1,198 @@
+//! The output row, and its three file forms.
+
+use polars::prelude::{Column, CsvWriter, DataFrame, ParquetWriter, SerWriter as _};
+use serde::Serialize;
+
+use crate::schema::SampleLabels;
+
+/// What the value is to the truth.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub enum Kind {
+    /// Aims at it.
+    #[serde(rename = "estimate")]
+    Estimate,
+    /// Its expectation is at most the truth.
+    #[serde(rename = "lower bound")]
+    LowerBound,
+    /// Its expectation is at least the truth, if the fitted density is good.
+    #[serde(rename = "upper bound")]
+    UpperBound,
+}
+
+impl Kind {
+    /// As printed.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Estimate => "estimate",
+            Self::LowerBound => "lower bound",
+            Self::UpperBound => "upper bound",
+        }
+    }
+}
+
+/// The scale of the value.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Unit {
+    /// Nats of mutual information.
+    Nats,
+    /// 2·JSD, in \[0, 2 ln 2\].
+    Jsd,
+}
+
+impl Unit {
+    /// As printed.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Nats => "nats",
+            Self::Jsd => "jsd",
+        }
+    }
+}
+
+/// One line of output. The field order is the order of JSON keys and Parquet columns.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Estimate {
+    /// Estimator, or one of the values it gives beside its main one.
+    pub estimator: String,
+    /// Columns of x.
+    pub x: String,
+    /// Columns of y.
+    pub y: String,
+    /// Columns conditioned on.
+    pub given: Option<String>,
+    /// Who sent the messages.
+    pub sender: Option<String>,
+    /// Who received them.
+    pub receiver: Option<String>,
+    /// Whether they arrived.
+    pub delivered: Option<bool>,
+    /// What one episode is.
+    pub group: String,
+    /// The value; infinite (JSON: null) for a deterministic copy.
+    pub value: f64,
+    /// Its unit.
+    pub unit: Unit,
+    /// What it is to the truth.
+    pub kind: Kind,
+    /// Lower end of the 95 % interval: of the truth for an estimate, of its own expectation for a bound.
+    pub interval_low: Option<f64>,
+    /// Upper end.
+    pub interval_high: Option<f64>,
+    /// Share of permutations with at least this dependence, the observed one counted.
+    pub p_value: Option<f64>,
+    /// Samples behind the value (held-out ones for trained estimators).
+    pub n: u64,
+    /// Independent samples that would give the same standard error.
+    pub n_effective: f64,
+    /// What to know before trusting it.
+    pub warnings: Vec<String>,
+}
+
+impl Estimate {
+    /// A row with the names filled in and no interval.
+    pub fn new(estimator: &str, labels: &SampleLabels, value: f64, unit: Unit, kind: Kind, n: usize) -> Self {
+        Self {
+            estimator: estimator.to_owned(),
+            x: labels.x.clone(),
+            y: labels.y.clone(),
+            given: labels.given.clone(),
+            sender: labels.sender.clone(),
+            receiver: labels.receiver.clone(),
+            delivered: labels.delivered,
+            group: labels.group.clone(),
+            value,
+            unit,
+            kind,
+            interval_low: None,
+            interval_high: None,
+            p_value: None,
+            n: n as u64,
+            n_effective: n as f64,
+            warnings: Vec::new(),
+        }
+    }
+}
+
+/// The rows as indented JSON.
+///
+/// # Errors
+/// A message, should serde refuse.
+pub fn to_json(rows: &[Estimate]) -> Result<Vec<u8>, String> {
+    let mut text = serde_json::to_vec_pretty(rows).map_err(|e| e.to_string())?;
+    text.push(b'\n');
+    Ok(text)
+}
+
+/// The rows as a Parquet file; warnings are joined by `; `.
+///
+/// # Errors
+/// A message, should polars refuse.
+pub fn to_parquet(rows: &[Estimate]) -> Result<Vec<u8>, String> {
+    let mut bytes = Vec::new();
+    let mut frame = frame(rows)?;
+    ParquetWriter::new(&mut bytes).finish(&mut frame).map_err(|e| e.to_string())?;
+    Ok(bytes)
+}
+
+/// The rows as CSV with a header; warnings are joined by `; `.
+///
+/// # Errors
+/// A message, should polars refuse.
+pub fn to_csv(rows: &[Estimate]) -> Result<Vec<u8>, String> {
+    let mut bytes = Vec::new();
+    CsvWriter::new(&mut bytes).finish(&mut frame(rows)?).map_err(|e| e.to_string())?;
+    Ok(bytes)
+}
+
+fn frame(rows: &[Estimate]) -> Result<DataFrame, String> {
+    let text = |name: &str, of: fn(&Estimate) -> Option<String>| {
+        Column::new(name.into(), rows.iter().map(of).collect::<Vec<Option<String>>>())
+    };
+    let number = |name: &str, of: fn(&Estimate) -> Option<f64>| {
+        Column::new(name.into(), rows.iter().map(of).collect::<Vec<Option<f64>>>())
+    };
+    let columns = vec![
+        text("estimator", |r| Some(r.estimator.clone())),
+        text("x", |r| Some(r.x.clone())),
+        text("y", |r| Some(r.y.clone())),
+        text("given", |r| r.given.clone()),
+        text("sender", |r| r.sender.clone()),
+        text("receiver", |r| r.receiver.clone()),
+        Column::new("delivered".into(), rows.iter().map(|r| r.delivered).collect::<Vec<Option<bool>>>()),
+        text("group", |r| Some(r.group.clone())),
+        number("value", |r| Some(r.value)),
+        text("unit", |r| Some(r.unit.name().to_owned())),
+        text("kind", |r| Some(r.kind.name().to_owned())),
+        number("interval_low", |r| r.interval_low),
+        number("interval_high", |r| r.interval_high),
+        number("p_value", |r| r.p_value),
+        Column::new("n".into(), rows.iter().map(|r| r.n).collect::<Vec<u64>>()),
+        number("n_effective", |r| Some(r.n_effective)),
+        text("warnings", |r| Some(r.warnings.join("; "))),
+    ];
+    DataFrame::new(rows.len(), columns).map_err(|e| e.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_keys_are_those_of_the_design_in_order() {
+        let labels = SampleLabels { x: "a".to_owned(), y: "b".to_owned(), ..SampleLabels::default() };
+        let mut row = Estimate::new("gaussian", &labels, f64::INFINITY, Unit::Nats, Kind::LowerBound, 7);
+        row.warnings = vec!["one".to_owned(), "two".to_owned()];
+        let keys = "estimator x y given sender receiver delivered group value unit kind interval_low interval_high \
+                    p_value n n_effective warnings";
+        let value = serde_json::to_value(&row).unwrap();
+        let found: Vec<&str> = value.as_object().unwrap().keys().map(String::as_str).collect();
+        assert_eq!(found.join(" "), keys);
+        assert_eq!((&value["kind"], &value["unit"]), (&"lower bound".into(), &"nats".into()));
+        assert!(value["value"].is_null());
+        let csv = String::from_utf8(to_csv(&[row.clone()]).unwrap()).unwrap();
+        assert_eq!(csv.lines().next().unwrap(), keys.replace(' ', ","));
+        assert!(csv.contains("one; two"), "{csv}");
+        assert_eq!(&to_parquet(&[row]).unwrap()[..4], b"PAR1");
+    }
+}

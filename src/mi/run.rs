@@ -1,0 +1,172 @@
+//! All jobs of a command in parallel: every set of samples with every estimator, in a fixed order.
+
+use rayon::prelude::*;
+
+use super::{Estimate, Estimator, Kind, MiError, Protocol, Unit};
+use crate::rng::Seeds;
+use crate::schema::{SampleLabels, Samples};
+
+/// What to run.
+pub struct Plan {
+    /// Estimators with their names.
+    pub estimators: Vec<(String, Box<dyn Estimator>)>,
+    /// What all hold to.
+    pub protocol: Protocol,
+    /// Root of all randomness.
+    pub seed: u64,
+}
+
+/// One estimator on one set of samples.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Job {
+    /// Estimator.
+    pub estimator: String,
+    /// Samples.
+    pub labels: SampleLabels,
+}
+
+/// How a job ended.
+#[derive(Debug)]
+pub struct JobResult {
+    /// Which job.
+    pub job: Job,
+    /// Its rows, or why there are none.
+    pub rows: Result<Vec<Estimate>, MiError>,
+}
+
+/// Runs every estimator on every set of samples on rayon's current pool; `done` is called after each job.
+///
+/// The result does not depend on the number of threads: a job's randomness comes from its name.
+pub fn run(samples: &[Samples], plan: &Plan, done: &(dyn Fn() + Sync)) -> Vec<JobResult> {
+    let seeds = Seeds::new(plan.seed).child("estimate-mi");
+    let jobs: Vec<(&Samples, &(String, Box<dyn Estimator>))> =
+        samples.iter().flat_map(|s| plan.estimators.iter().map(move |e| (s, e))).collect();
+    let work = |&(samples, (name, estimator)): &(&Samples, &(String, Box<dyn Estimator>))| {
+        let labels = samples.labels.clone();
+        let seeds = seeds.child(&format!("{}/{}/{:?}", labels.x, labels.y, labels.delivered)).child(name);
+        let rows = estimator.estimate(samples, &plan.protocol, &seeds);
+        done();
+        JobResult { job: Job { estimator: name.clone(), labels }, rows }
+    };
+    let mut results: Vec<JobResult> = jobs.par_iter().map(work).collect();
+    for same_samples in results.chunks_mut(plan.estimators.len().max(1)) {
+        compare(same_samples);
+    }
+    results
+}
+
+/// An upper bound below a lower bound of the same samples is none.
+fn compare(results: &mut [JobResult]) {
+    let rows = || results.iter().flat_map(|r| r.rows.iter().flatten());
+    let lower = rows()
+        .filter(|r| r.kind == Kind::LowerBound && r.unit == Unit::Nats)
+        .filter_map(|r| Some((r.interval_low?, r.estimator.clone())))
+        .max_by(|a, b| a.0.total_cmp(&b.0));
+    let Some((low, name)) = lower else { return };
+    for row in results.iter_mut().flat_map(|r| r.rows.iter_mut().flatten()) {
+        if row.kind == Kind::UpperBound && row.value + 1e-3 < low {
+            row.warnings.push(format!("below the lower bound {name} ({low:.3}): q fits badly, this is no upper bound"));
+        }
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::mi::ESTIMATORS;
+    use crate::registry::Spec;
+    use crate::rng;
+    use crate::schema::{Columns, Exchange};
+
+    /// Samples from rows, each its own episode; columns x0, x1, … and y0, y1, …
+    pub(in crate::mi) fn samples_of(x: &[Vec<f64>], y: &[Vec<f64>]) -> Samples {
+        let columns = |rows: &[Vec<f64>], name: &str| {
+            let names = (0..rows[0].len()).map(|i| format!("{name}{i}")).collect();
+            Arc::new(Columns { data: rows.concat(), names })
+        };
+        Samples {
+            x: columns(x, "x"),
+            y: columns(y, "y"),
+            z: None,
+            starts: (0..=x.len()).collect::<Vec<_>>().into(),
+            rows: (0..x.len() as u32).collect(),
+            exchange: Exchange::Episodes,
+            labels: SampleLabels {
+                x: "x".to_owned(),
+                y: "y".to_owned(),
+                group: "row".to_owned(),
+                ..SampleLabels::default()
+            },
+            notes: Vec::new(),
+        }
+    }
+
+    /// `width` columns on either side, the first pair correlated by `rho`, all else independent normals.
+    pub(in crate::mi) fn linear_samples(rho: f64, n: usize, width: usize, seed: u64) -> Samples {
+        let mut rng = Seeds::new(seed).stream("linear");
+        let mut draw = |width: usize| (0..width).map(|_| rng::normal(&mut rng)).collect::<Vec<f64>>();
+        let (mut x, mut y) = (Vec::new(), Vec::new());
+        for _ in 0..n {
+            let (a, mut b) = (draw(width), draw(width));
+            b[0] = rho * a[0] + (1.0 - rho * rho).sqrt() * b[0];
+            x.push(a);
+            y.push(b);
+        }
+        samples_of(&x, &y)
+    }
+
+    pub(in crate::mi) fn plan(names: &[&str], permutations: usize, seed: u64) -> Plan {
+        let build = |name: &&str| {
+            let entry = crate::registry::find("estimator", ESTIMATORS, name).unwrap();
+            ((*name).to_owned(), (entry.build)(&Spec::new(name)).unwrap())
+        };
+        Plan { estimators: names.iter().map(build).collect(), protocol: Protocol { permutations }, seed }
+    }
+
+    fn rows(samples: &Samples, plan: &Plan) -> Vec<Estimate> {
+        run(std::slice::from_ref(samples), plan, &|| ()).into_iter().flat_map(|r| r.rows.unwrap()).collect()
+    }
+
+    fn value<'a>(rows: &'a [Estimate], name: &str) -> &'a Estimate {
+        rows.iter().find(|r| r.estimator == name).unwrap()
+    }
+
+    #[test]
+    fn independent_wide_data_give_nothing_on_held_out_rows() {
+        let rows = rows(&linear_samples(0.0, 1000, 10, 1), &plan(&["jsd", "gaussian"], 99, 1));
+        for row in rows.iter().filter(|r| r.kind == Kind::LowerBound) {
+            assert!(row.value <= 0.02, "{}: {}", row.estimator, row.value);
+        }
+        assert!(rows.iter().all(|r| r.p_value.unwrap() > 0.01), "{rows:?}");
+    }
+
+    #[test]
+    fn club_below_a_lower_bound_says_so() {
+        let labels = SampleLabels::default();
+        let job = |row: Estimate| JobResult {
+            job: Job { estimator: row.estimator.clone(), labels: labels.clone() },
+            rows: Ok(vec![row]),
+        };
+        let upper = Estimate::new("club", &labels, 0.1, Unit::Nats, Kind::UpperBound, 9);
+        let mut lower = Estimate::new("jsd-nwj", &labels, 0.5, Unit::Nats, Kind::LowerBound, 9);
+        lower.interval_low = Some(0.4);
+        let mut results = [job(upper), job(lower)];
+        compare(&mut results);
+        let warnings = &results[0].rows.as_ref().unwrap()[0].warnings;
+        assert_eq!(*warnings, ["below the lower bound jsd-nwj (0.400): q fits badly, this is no upper bound"]);
+    }
+
+    #[test]
+    fn results_do_not_depend_on_the_number_of_threads() {
+        let sets: Vec<Samples> = (0..3).map(|i| linear_samples(0.6, 300, 2, i)).collect();
+        let plan = plan(&["gaussian", "club", "jsd"], 19, 5);
+        let with = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let results = pool.install(|| run(&sets, &plan, &|| ()));
+            results.into_iter().flat_map(|r| r.rows.unwrap()).collect::<Vec<_>>()
+        };
+        assert_eq!(with(1), with(3));
+    }
+}

@@ -1,1 +1,0 @@
-//! Samples from stores and tables.

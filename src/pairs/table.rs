@@ -1,0 +1,310 @@
+//! Samples from named columns of a CSV or Parquet file.
+
+use std::fs::File;
+use std::io::Read as _;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::Path;
+use std::sync::Arc;
+
+use polars::prelude::{Column, CsvReadOptions, DataFrame, DataType, ParquetReader, PolarsError, SerReader as _};
+
+use super::PairsError;
+use crate::io::IoError;
+use crate::registry::did_you_mean;
+use crate::schema::{Columns, Exchange, SampleLabels, Samples};
+
+/// Blocks into which one series is cut.
+const BLOCKS: usize = 50;
+
+/// Which columns to read, and what an episode is.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct TableOptions {
+    /// Columns of x; a vector column counts as many as it is long.
+    pub x: Vec<String>,
+    /// Columns of y.
+    pub y: Vec<String>,
+    /// Rows of equal value are one episode.
+    pub group: Option<String>,
+    /// Order of the rows within an episode; without `group` all rows are one series.
+    pub time: Option<String>,
+}
+
+/// Whether a path is a rollout store: a directory, an `.mcap` file, or Parquet with the key `ccmarl.manifest`.
+///
+/// # Errors
+/// [`IoError::Missing`] when nothing is there; [`PairsError::Unreadable`] for a damaged `.parquet` file.
+pub fn is_store(path: &Path) -> Result<bool, PairsError> {
+    if !path.exists() {
+        return Err(IoError::Missing(path.to_owned()).into());
+    }
+    if path.is_dir() || path.extension().is_some_and(|e| e.eq_ignore_ascii_case("mcap")) {
+        return Ok(true);
+    }
+    caught(path, |form| {
+        if form != "Parquet" {
+            return Ok(false);
+        }
+        let mut reader = ParquetReader::new(File::open(path).map_err(IoError::os("open", path))?);
+        let metadata = reader.get_metadata().map_err(unreadable(form, path))?;
+        Ok(metadata.key_value_metadata().iter().flatten().any(|kv| kv.key == "ccmarl.manifest"))
+    })
+}
+
+/// Samples from the named columns. Rows with a missing value are left out and counted in the notes.
+///
+/// # Errors
+/// [`PairsError`] that names column and row.
+pub fn table(path: &Path, options: &TableOptions) -> Result<Samples, PairsError> {
+    if !path.exists() {
+        return Err(IoError::Missing(path.to_owned()).into());
+    }
+    caught(path, |form| samples(path, form, options))
+}
+
+fn samples(path: &Path, form: &'static str, options: &TableOptions) -> Result<Samples, PairsError> {
+    let keys = options.group.iter().chain(&options.time);
+    let wanted: Vec<&str> = options.x.iter().chain(&options.y).chain(keys).map(String::as_str).collect();
+    let frame = read(path, form, &wanted)?;
+    let (x, y) = (numbers(&frame, &options.x, path)?, numbers(&frame, &options.y, path)?);
+    let height = frame.height();
+    let group = options.group.as_deref().map(|name| texts(&frame, name, path)).transpose()?;
+    let time = options.time.as_deref().map(|name| Order::of(&frame, name, path)).transpose()?;
+    let whole = |r: usize| {
+        let values = || x.row(r).iter().chain(y.row(r));
+        values().all(|v| !v.is_nan())
+            && group.as_ref().is_none_or(|g| g[r].is_some())
+            && time.as_ref().is_none_or(|t| t.has(r))
+    };
+    let mut rows: Vec<usize> = (0..height).filter(|&r| whole(r)).collect();
+    let columns = wanted.join(", ");
+    if rows.is_empty() {
+        return Err(PairsError::NoRows { rows: height, columns, path: path.to_owned() });
+    }
+    if height > u32::MAX as usize {
+        return Err(PairsError::TooManyRows);
+    }
+    let mut notes = Vec::new();
+    if rows.len() < height {
+        notes.push(format!("{} of {height} rows left out: a missing value in {columns}", height - rows.len()));
+    }
+    if let Some(time) = &time {
+        rows.sort_by(|&a, &b| time.compare(a, b));
+    }
+    let (starts, label) = episodes(&mut rows, group.as_deref(), options);
+    let pick = |columns: &Columns| {
+        let data = rows.iter().flat_map(|&r| columns.row(r).iter().copied()).collect();
+        Arc::new(Columns { data, names: columns.names.clone() })
+    };
+    Ok(Samples {
+        x: pick(&x),
+        y: pick(&y),
+        z: None,
+        starts: starts.into(),
+        rows: (0..rows.len() as u32).collect(),
+        exchange: if group.is_none() && time.is_some() { Exchange::Shift } else { Exchange::Episodes },
+        labels: SampleLabels {
+            x: options.x.join(","),
+            y: options.y.join(","),
+            group: label,
+            ..SampleLabels::default()
+        },
+        notes,
+    })
+}
+
+/// Puts the rows of an episode together (in order of first appearance) and says where episodes start.
+fn episodes(rows: &mut [usize], group: Option<&[Option<String>]>, options: &TableOptions) -> (Vec<usize>, String) {
+    let n = rows.len();
+    let Some(keys) = group else {
+        return match &options.time {
+            Some(time) => {
+                let blocks = BLOCKS.min(n);
+                ((0..=blocks).map(|b| b * n / blocks).collect(), format!("blocks of {time}"))
+            }
+            None => ((0..=n).collect(), "row".to_owned()),
+        };
+    };
+    let mut first = std::collections::BTreeMap::new();
+    for &r in rows.iter() {
+        let next = first.len();
+        first.entry(keys[r].as_deref()).or_insert(next);
+    }
+    rows.sort_by_key(|&r| first.get(&keys[r].as_deref()));
+    let mut starts: Vec<usize> = (0..n).filter(|&i| i == 0 || keys[rows[i]] != keys[rows[i - 1]]).collect();
+    starts.push(n);
+    (starts, options.group.clone().unwrap_or_default())
+}
+
+/// `Parquet` or `CSV`, by the first bytes, else by the extension.
+fn form(path: &Path) -> Result<&'static str, IoError> {
+    let mut magic = [0; 4];
+    let file = File::open(path).map_err(IoError::os("open", path))?;
+    let read = file.take(4).read(&mut magic).map_err(IoError::os("read", path))?;
+    let named = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("parquet"));
+    Ok(if named || magic[..read] == *b"PAR1" { "Parquet" } else { "CSV" })
+}
+
+/// Runs what touches a foreign file's data; a panic in there becomes an error of ours.
+fn caught<T>(path: &Path, read: impl FnOnce(&'static str) -> Result<T, PairsError>) -> Result<T, PairsError> {
+    let form = form(path)?;
+    let hook = std::panic::take_hook();
+    std::panic::set_hook(Box::new(|_| ()));
+    let result = catch_unwind(AssertUnwindSafe(|| read(form)));
+    std::panic::set_hook(hook);
+    result.unwrap_or_else(|_| {
+        Err(PairsError::Unreadable { form, message: "the file is damaged".to_owned(), path: path.to_owned() })
+    })
+}
+
+/// The first line of what polars has to say.
+fn unreadable(form: &'static str, path: &Path) -> impl Fn(PolarsError) -> PairsError {
+    let path = path.to_owned();
+    move |error| {
+        let message = error.to_string().lines().next().unwrap_or_default().to_owned();
+        PairsError::Unreadable { form, message, path: path.clone() }
+    }
+}
+
+/// The wanted columns of the file.
+fn read(path: &Path, form: &'static str, wanted: &[&str]) -> Result<DataFrame, PairsError> {
+    let open = || File::open(path).map_err(IoError::os("open", path));
+    let unreadable = unreadable(form, path);
+    let names: Vec<String> = if form == "Parquet" {
+        let schema = ParquetReader::new(open()?).schema().map_err(&unreadable)?;
+        schema.iter_names().map(ToString::to_string).collect()
+    } else {
+        let options = CsvReadOptions::default().with_n_rows(Some(0)).with_infer_schema_length(Some(0));
+        let frame = options.into_reader_with_file_handle(open()?).finish().map_err(&unreadable)?;
+        frame.get_column_names().into_iter().map(ToString::to_string).collect()
+    };
+    if let Some(&name) = wanted.iter().find(|w| !names.iter().any(|n| n == *w)) {
+        let hint = did_you_mean(name, names.iter().map(String::as_str));
+        return Err(PairsError::UnknownColumn { name: name.to_owned(), hint, path: path.to_owned() });
+    }
+    let mut columns: Vec<&str> = wanted.to_vec();
+    columns.sort_unstable();
+    columns.dedup();
+    let frame = if form == "Parquet" {
+        let columns = columns.iter().map(|c| (*c).to_owned()).collect();
+        ParquetReader::new(open()?).with_columns(Some(columns)).finish()
+    } else {
+        // the whole file decides a column's type: a float in the last row must not be an error
+        let columns = columns.iter().map(|&c| c.into()).collect();
+        let options = CsvReadOptions::default().with_infer_schema_length(None).with_columns(Some(columns));
+        options.into_reader_with_file_handle(open()?).finish()
+    };
+    frame.map_err(unreadable)
+}
+
+fn is_numeric(kind: &DataType) -> bool {
+    kind.is_primitive_numeric() || kind.is_bool()
+}
+
+fn column<'a>(frame: &'a DataFrame, name: &str, path: &Path) -> Result<&'a Column, PairsError> {
+    frame.column(name).map_err(unreadable("table", path))
+}
+
+fn not_numeric(frame: &DataFrame, column: &Column, path: &Path) -> PairsError {
+    let numeric: Vec<&str> =
+        frame.columns().iter().filter(|c| is_numeric(c.dtype())).map(|c| c.name().as_str()).collect();
+    let hint = if numeric.is_empty() {
+        "none of the columns asked for is numeric".to_owned()
+    } else {
+        format!("of the columns asked for, {} are numeric", numeric.join(", "))
+    };
+    let kind = if column.dtype() == &DataType::String { "text".to_owned() } else { column.dtype().to_string() };
+    PairsError::NotNumeric { name: column.name().to_string(), kind, hint, path: path.to_owned() }
+}
+
+/// Named columns side by side, vectors flattened; a missing value is NaN.
+fn numbers(frame: &DataFrame, names: &[String], path: &Path) -> Result<Columns, PairsError> {
+    let mut parts: Vec<(usize, Vec<f64>)> = Vec::new();
+    let mut out = Columns::default();
+    for name in names {
+        let column = column(frame, name, path)?;
+        let (width, values) = flat(frame, column, path)?;
+        if let Some(at) = values.iter().position(|v| v.is_infinite()) {
+            return Err(PairsError::Infinite { name: name.clone(), row: at / width + 1, path: path.to_owned() });
+        }
+        if width == 1 && is_numeric(column.dtype()) {
+            out.names.push(name.clone());
+        } else {
+            out.names.extend((0..width).map(|i| format!("{name}[{i}]")));
+        }
+        parts.push((width, values));
+    }
+    for row in 0..frame.height() {
+        parts.iter().for_each(|(width, values)| out.data.extend_from_slice(&values[row * width..(row + 1) * width]));
+    }
+    Ok(out)
+}
+
+/// Width and row-major values of one column.
+fn flat(frame: &DataFrame, column: &Column, path: &Path) -> Result<(usize, Vec<f64>), PairsError> {
+    let unfit = || not_numeric(frame, column, path);
+    let plain = |column: &Column| -> Result<Vec<f64>, PairsError> {
+        let cast = column.cast(&DataType::Float64).map_err(|_| unfit())?;
+        Ok(cast.f64().map_err(|_| unfit())?.iter().map(|v| v.unwrap_or(f64::NAN)).collect())
+    };
+    let vectors: Vec<Option<Vec<f64>>> = match column.dtype() {
+        kind if is_numeric(kind) => return Ok((1, plain(column)?)),
+        DataType::Array(inner, _) | DataType::List(inner) if is_numeric(inner) => {
+            let list = column.cast(&DataType::List(Box::new(DataType::Float64))).map_err(|_| unfit())?;
+            let list = list.list().map_err(|_| unfit())?.clone();
+            (0..list.len())
+                .map(|i| list.get_as_series(i).map(|s| plain(&s.into())).transpose())
+                .collect::<Result<_, _>>()?
+        }
+        _ => return Err(unfit()),
+    };
+    let width = vectors.iter().flatten().map(Vec::len).next().unwrap_or(1).max(1);
+    let mut data = Vec::with_capacity(vectors.len() * width);
+    for (row, vector) in vectors.into_iter().enumerate() {
+        let vector = vector.unwrap_or_else(|| vec![f64::NAN; width]);
+        if vector.len() != width {
+            let (name, path) = (column.name().to_string(), path.to_owned());
+            return Err(PairsError::Ragged { name, row: row + 1, expected: width, found: vector.len(), path });
+        }
+        data.extend(vector);
+    }
+    Ok((width, data))
+}
+
+/// A column as text, for grouping.
+fn texts(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<Option<String>>, PairsError> {
+    let column = column(frame, name, path)?;
+    let cast = column.cast(&DataType::String).map_err(|_| not_numeric(frame, column, path))?;
+    let values = cast.str().map_err(|_| not_numeric(frame, column, path))?;
+    Ok(values.iter().map(|v| v.map(str::to_owned)).collect())
+}
+
+/// A column that orders rows: numbers by size, text by its bytes (ISO dates sort rightly).
+enum Order {
+    Numbers(Vec<f64>),
+    Texts(Vec<Option<String>>),
+}
+
+impl Order {
+    fn of(frame: &DataFrame, name: &str, path: &Path) -> Result<Self, PairsError> {
+        let column = column(frame, name, path)?;
+        if column.dtype() == &DataType::String {
+            return texts(frame, name, path).map(Self::Texts);
+        }
+        let (width, values) = flat(frame, column, path)?;
+        if width == 1 { Ok(Self::Numbers(values)) } else { Err(not_numeric(frame, column, path)) }
+    }
+
+    fn has(&self, row: usize) -> bool {
+        match self {
+            Self::Numbers(values) => !values[row].is_nan(),
+            Self::Texts(values) => values[row].is_some(),
+        }
+    }
+
+    fn compare(&self, a: usize, b: usize) -> std::cmp::Ordering {
+        match self {
+            Self::Numbers(values) => values[a].total_cmp(&values[b]),
+            Self::Texts(values) => values[a].cmp(&values[b]),
+        }
+    }
+}

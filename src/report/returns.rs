@@ -1,0 +1,346 @@
+//! Returns by test channel and algorithm: the table behind bars, Markdown, CSV and page.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+use crate::io::printable;
+use crate::report::published::{coefficients, misprints};
+use crate::report::{Published, ReportError, Run, Tables, Task};
+use crate::stats::{Interval, mean, sd, t_interval};
+
+/// Test channels in the order of columns; others follow by name.
+pub const CHANNELS: [&str; 8] =
+    ["unrestricted", "mbc-light", "mbc-medium", "mbc-heavy", "dbc-light", "dbc-medium", "dbc-heavy", "none"];
+
+/// Algorithms in the order of rows; others follow by name.
+const ALGORITHMS: [&str; 9] = [
+    "maddpg",
+    "fc-maddpg",
+    "dropout-maddpg-0.2",
+    "dropout-maddpg-0.5",
+    "dropout-maddpg-0.8",
+    "cc-maddpg",
+    "qmix",
+    "cc-qmix",
+    "maic",
+];
+
+/// Fewest seeds that give an interval over seeds.
+const SEEDS_FOR_INTERVAL: usize = 3;
+
+/// Returns of the policies that bracket a task; they hear no messages, so channels do not matter to them.
+#[derive(Clone, Debug)]
+pub struct Reference {
+    /// The task.
+    pub task: Task,
+    /// Episode returns of the random policy.
+    pub random: Vec<f64>,
+    /// Episode returns of the oracle (a hand-written rule that sees everything).
+    pub oracle: Vec<f64>,
+}
+
+/// One algorithm under one channel.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Cell {
+    /// Test episodes, all seeds.
+    pub episodes: usize,
+    /// Mean over seeds of the mean over episodes.
+    pub mean: f64,
+    /// Standard deviation over episodes.
+    pub sd: f64,
+    /// 95 % Student interval over seeds, of three or more.
+    pub interval: Option<Interval>,
+    /// Realised share of lost messages.
+    pub loss_rate: f64,
+    /// The published cell.
+    pub published: Option<Published>,
+    /// Whether no other row of the column is better beyond the intervals; never with fewer than three seeds.
+    pub best: bool,
+}
+
+impl Cell {
+    /// Half-width of what stands behind the ±: the interval over seeds, else one deviation over episodes.
+    pub fn spread(&self) -> f64 {
+        self.interval.map_or(self.sd, |i| (i.high - i.low) / 2.0)
+    }
+}
+
+/// One algorithm.
+#[derive(Clone, Debug)]
+pub struct Row {
+    /// Its name, with the settings that tell it from others of the same name.
+    pub series: String,
+    /// Seeds, ascending.
+    pub seeds: Vec<u64>,
+    /// One per channel of the table; `None` where it was not evaluated.
+    pub cells: Vec<Option<Cell>>,
+}
+
+/// The table of one task.
+#[derive(Clone, Debug)]
+pub struct Returns {
+    /// The task.
+    pub task: Task,
+    /// What a reward counts, in one line.
+    pub convention: String,
+    /// Columns.
+    pub channels: Vec<String>,
+    /// Rows.
+    pub rows: Vec<Row>,
+    /// Reference policies: name, mean, standard deviation over episodes, episodes.
+    pub references: Vec<(&'static str, f64, f64, usize)>,
+    /// What a reader must know, misprints of the paper included.
+    pub notes: Vec<String>,
+}
+
+/// One line of the tidy CSV.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[expect(missing_docs, reason = "the fields are the columns, named like those of the table")]
+pub struct Tidy {
+    pub scenario: String,
+    pub profile: String,
+    pub agents: i64,
+    pub channel: String,
+    pub algorithm: String,
+    pub seeds: usize,
+    pub episodes: usize,
+    pub mean: f64,
+    pub sd_over_episodes: f64,
+    pub interval_low: Option<f64>,
+    pub interval_high: Option<f64>,
+    pub loss_rate: Option<f64>,
+    pub published_mean: Option<f64>,
+    pub published_sd: Option<f64>,
+    pub published_table: Option<&'static str>,
+    pub difference: Option<f64>,
+    pub best: bool,
+}
+
+/// Runs of equal settings, in row order, each with its name.
+///
+/// # Errors
+/// [`ReportError::Duplicate`]: two runs of one series with one seed.
+pub(super) fn series<'a>(runs: &[&'a Run]) -> Result<Vec<(String, Vec<&'a Run>)>, ReportError> {
+    let mut groups: BTreeMap<(usize, &str, &BTreeMap<String, String>), Vec<&'a Run>> = BTreeMap::new();
+    for run in runs {
+        let rank = ALGORITHMS.iter().position(|a| *a == run.algorithm).unwrap_or(ALGORITHMS.len());
+        let group = groups.entry((rank, &run.algorithm, &run.settings)).or_default();
+        if let Some(twin) = group.iter().find(|other| other.seed == run.seed) {
+            return Err(ReportError::Duplicate {
+                series: run.algorithm.clone(),
+                seed: run.seed,
+                first: twin.path.clone(),
+                path: run.path.clone(),
+            });
+        }
+        group.push(run);
+    }
+    let same_name = |name: &str| groups.keys().filter(|(_, n, _)| *n == name).map(|(_, _, s)| *s).collect::<Vec<_>>();
+    let named = groups.iter().map(|((_, name, settings), group)| {
+        let mut group = group.clone();
+        group.sort_by_key(|r| r.seed);
+        (label(name, settings, &same_name(name), group[0]), group)
+    });
+    Ok(named.collect())
+}
+
+/// The algorithm's name, and in brackets what tells it from its namesakes or from its preset.
+fn label(
+    name: &str,
+    settings: &BTreeMap<String, String>,
+    namesakes: &[&BTreeMap<String, String>],
+    run: &Run,
+) -> String {
+    let mut differing: BTreeMap<&str, &str> = BTreeMap::new();
+    for other in namesakes {
+        for key in settings.keys().chain(other.keys()).filter(|k| settings.get(*k) != other.get(*k)) {
+            differing.insert(key, settings.get(key).map_or("default", |v| v.trim_matches('"')));
+        }
+    }
+    if name == "cc-maddpg" {
+        let (beta, alpha) = coefficients(run);
+        for (key, value) in [("dumie.alpha", alpha), ("dumie.beta", beta)] {
+            if value == Some(0.0) {
+                differing.insert(key, "0");
+            }
+        }
+    }
+    let name = printable(name);
+    if differing.is_empty() {
+        return name;
+    }
+    let words: Vec<String> =
+        differing.iter().map(|(key, value)| format!("{}={value}", key.strip_prefix("dumie.").unwrap_or(key))).collect();
+    format!("{name} ({})", printable(&words.join(", ")))
+}
+
+/// The table of one task's runs; `None` when none was evaluated.
+///
+/// # Errors
+/// [`ReportError::Duplicate`], [`ReportError::Internal`].
+pub(super) fn table(
+    task: &Task,
+    convention: &str,
+    runs: &[&Run],
+    reference: Option<&Reference>,
+    tables: &Tables,
+) -> Result<Option<Returns>, ReportError> {
+    let evaluated: Vec<&Run> = runs.iter().copied().filter(|r| !r.episodes.is_empty()).collect();
+    if evaluated.is_empty() {
+        return Ok(None);
+    }
+    let mut channels: Vec<String> = Vec::new();
+    for channel in evaluated.iter().flat_map(|r| &r.episodes).map(|e| &e.channel) {
+        if !channels.contains(channel) {
+            channels.push(channel.clone());
+        }
+    }
+    let rank = |c: &String| CHANNELS.iter().position(|k| k == c).unwrap_or(CHANNELS.len());
+    channels.sort_by(|a, b| rank(a).cmp(&rank(b)).then(a.cmp(b)));
+    let mut rows = Vec::new();
+    let mut shown = Vec::new();
+    for (name, group) in series(&evaluated)? {
+        let cells = channels.iter().map(|channel| cell(&group, channel, tables)).collect::<Vec<_>>();
+        for (channel, cell) in channels.iter().zip(&cells) {
+            if let Some(published) = cell.as_ref().and_then(|c| c.published) {
+                shown.push((group[0].algorithm.clone(), channel.clone(), published));
+            }
+        }
+        rows.push(Row { series: name, seeds: group.iter().map(|r| r.seed).collect(), cells });
+    }
+    mark_best(&mut rows, channels.len());
+    let mut references = Vec::new();
+    if let Some(reference) = reference {
+        for (name, values) in [("random", &reference.random), ("oracle", &reference.oracle)] {
+            if !values.is_empty() {
+                references.push((name, mean(values), sd(values), values.len()));
+            }
+        }
+    }
+    let mut notes = spread_notes(&rows);
+    if !shown.is_empty() {
+        notes.push(
+            "Published: mean ± standard deviation over 100 test episodes of one seed, as printed. The paper has no \
+             value for the channel none. The difference is ours minus published; with one published seed it has no \
+             test."
+                .to_owned(),
+        );
+    }
+    if !references.is_empty() {
+        notes.push(
+            "random and oracle hear no messages: one value stands for all channels, ± standard deviation over episodes."
+                .to_owned(),
+        );
+    }
+    notes.extend(misprints(task, &shown));
+    Ok(Some(Returns { task: task.clone(), convention: convention.to_owned(), channels, rows, references, notes }))
+}
+
+fn cell(group: &[&Run], channel: &str, tables: &Tables) -> Option<Cell> {
+    let of = |run: &Run| run.episodes.iter().filter(|e| e.channel == channel).cloned().collect::<Vec<_>>();
+    let by_seed: Vec<_> = group.iter().map(|run| of(run)).filter(|e| !e.is_empty()).collect();
+    if by_seed.is_empty() {
+        return None;
+    }
+    let means: Vec<f64> = by_seed.iter().map(|es| mean(&es.iter().map(|e| e.value).collect::<Vec<_>>())).collect();
+    let all: Vec<f64> = by_seed.iter().flatten().map(|e| e.value).collect();
+    let losses: Vec<f64> = by_seed.iter().flatten().map(|e| e.loss_rate).collect();
+    let enough = means.len() >= SEEDS_FOR_INTERVAL;
+    Some(Cell {
+        episodes: all.len(),
+        mean: mean(&means),
+        sd: if all.len() < 2 { 0.0 } else { sd(&all) },
+        interval: if enough { t_interval(&means, 0.95) } else { None },
+        loss_rate: mean(&losses),
+        published: tables.of(group[0], channel),
+        best: false,
+    })
+}
+
+/// Marks, per column, the highest mean and every row whose interval reaches into the best one's; only where all rows
+/// have intervals over seeds and there are at least two.
+fn mark_best(rows: &mut [Row], columns: usize) {
+    for column in 0..columns {
+        let cells: Vec<&Cell> = rows.iter().filter_map(|r| r.cells[column].as_ref()).collect();
+        if cells.len() < 2 || cells.iter().any(|c| c.interval.is_none()) {
+            continue;
+        }
+        let best = cells.iter().copied().max_by(|a, b| a.mean.total_cmp(&b.mean)).and_then(|c| c.interval);
+        let Some(best) = best else { continue };
+        for cell in rows.iter_mut().filter_map(|r| r.cells[column].as_mut()) {
+            cell.best = cell.interval.is_some_and(|i| i.high >= best.low);
+        }
+    }
+}
+
+fn spread_notes(rows: &[Row]) -> Vec<String> {
+    let few = rows.iter().filter(|r| r.seeds.len() < SEEDS_FOR_INTERVAL).count();
+    let mut notes = Vec::new();
+    if few < rows.len() {
+        notes.push("± with three or more seeds: half of the 95 % Student interval for the mean over seeds.".to_owned());
+    }
+    if few > 0 {
+        notes.push(
+            "± with fewer than three seeds: one standard deviation over episodes. It says how much episodes vary, not \
+             how sure the mean is over trainings: not a comparison of algorithms."
+                .to_owned(),
+        );
+        notes.push(
+            "No value is set in bold: a best algorithm is named only when every row has at least three seeds."
+                .to_owned(),
+        );
+    } else if rows.len() > 1 {
+        notes.push(
+            "Bold: the highest mean of a column, and every mean whose interval reaches into its interval.".to_owned(),
+        );
+    }
+    notes
+}
+
+impl Returns {
+    /// One line per algorithm and channel, then the reference policies.
+    pub fn tidy(&self) -> Vec<Tidy> {
+        let base = |algorithm: &str, channel: &str, mean: f64, sd: f64, episodes: usize| Tidy {
+            scenario: self.task.scenario.clone(),
+            profile: self.task.profile.clone(),
+            agents: self.task.agents,
+            channel: channel.to_owned(),
+            algorithm: algorithm.to_owned(),
+            seeds: 0,
+            episodes,
+            mean,
+            sd_over_episodes: sd,
+            interval_low: None,
+            interval_high: None,
+            loss_rate: None,
+            published_mean: None,
+            published_sd: None,
+            published_table: None,
+            difference: None,
+            best: false,
+        };
+        let mut lines = Vec::new();
+        for row in &self.rows {
+            for (channel, cell) in self.channels.iter().zip(&row.cells) {
+                let Some(cell) = cell else { continue };
+                lines.push(Tidy {
+                    seeds: row.seeds.len(),
+                    interval_low: cell.interval.map(|i| i.low),
+                    interval_high: cell.interval.map(|i| i.high),
+                    loss_rate: Some(cell.loss_rate),
+                    published_mean: cell.published.map(|p| p.mean),
+                    published_sd: cell.published.map(|p| p.sd),
+                    published_table: cell.published.map(|p| p.table),
+                    difference: cell.published.map(|p| cell.mean - p.mean),
+                    best: cell.best,
+                    ..base(&row.series, channel, cell.mean, cell.sd, cell.episodes)
+                });
+            }
+        }
+        for &(name, mean, sd, episodes) in &self.references {
+            lines.push(base(name, "all", mean, sd, episodes));
+        }
+        lines
+    }
+}

@@ -1,0 +1,169 @@
+//! The command line from outside: exit codes, stdout and stderr, help texts, `list`, `generate`, and the README's words.
+
+use std::process::{Command as Process, Stdio};
+
+use assert_cmd::Command;
+use ccmarl::cli::Cli;
+use clap::{CommandFactory as _, Parser as _};
+use serde_json::Value;
+
+/// The program, with nothing of this terminal.
+fn ccmarl(args: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ccmarl"));
+    command.env_remove("COLUMNS").write_stdin("").args(args);
+    command
+}
+
+/// Exit code, stdout, stderr.
+fn run(args: &[&str]) -> (i32, String, String) {
+    let output = ccmarl(args).output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    (output.status.code().unwrap(), text(output.stdout), text(output.stderr))
+}
+
+#[test]
+fn version_and_help_go_to_stdout_with_exit_code_0() {
+    let version = format!("ccmarl {}\n", env!("CARGO_PKG_VERSION"));
+    assert_eq!(run(&["--version"]), (0, version, String::new()));
+    let (code, out, err) = run(&["--help"]);
+    assert_eq!((code, err.as_str()), (0, ""));
+    assert!(out.contains("Usage: ccmarl <COMMAND>"), "{out}");
+}
+
+#[test]
+fn usage_faults_exit_2_and_name_the_nearest() {
+    for (args, hint) in [
+        (&["lisst"][..], "'list'"),
+        (&["list", "scenaro"], "'scenario'"),
+        (&["list", "--fromat", "json"], "'--format'"),
+        (&[], "Usage: ccmarl <COMMAND>"),
+    ] {
+        let (code, out, err) = run(args);
+        assert_eq!((code, out.as_str()), (2, ""), "{args:?}: {err}");
+        assert!(err.contains(hint), "{args:?}: {err}");
+    }
+}
+
+#[test]
+fn unknown_plugins_exit_2_and_name_the_nearest_wherever_they_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    for (words, fault) in [
+        ("record --scenario simple_tga", "unknown scenario \"simple_tga\": did you mean simple_tag"),
+        ("record --scenario simple_tag --link dropuot:0.2", "unknown link \"dropuot\": did you mean dropout?"),
+        ("record --scenario simple_tag --policy prob:0.5", "unknown policy \"prob\": did you mean probe?"),
+        (
+            "train --scenario simple_spread --algorithm cc-madpg",
+            "unknown algorithm \"cc-madpg\": did you mean cc-maddpg",
+        ),
+        (
+            "estimate-mi datasets/tables/iris.csv --x a --y b --estimator gausian",
+            "unknown estimator \"gausian\": did you mean",
+        ),
+    ] {
+        let mut args: Vec<&str> = words.split(' ').collect();
+        args.extend(["--out", out.to_str().unwrap()]);
+        let (code, stdout, err) = run(&args);
+        assert_eq!((code, stdout.as_str()), (2, ""), "{words}: {err}");
+        assert!(err.starts_with(&format!("error: {fault}")) && err.lines().count() == 1, "{words}: {err}");
+        assert!(!out.exists(), "{words} left something behind");
+    }
+}
+
+#[test]
+fn a_reader_that_leaves_is_no_error() {
+    for args in [&["--help"][..], &["list"], &["list", "--format", "json"], &["generate", "completions", "bash"]] {
+        let mut process = Process::new(env!("CARGO_BIN_EXE_ccmarl"));
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        let output = process.args(args).stdin(Stdio::null()).stdout(writer).stderr(Stdio::piped()).output().unwrap();
+        assert_eq!(output.status.code(), Some(0), "{args:?}");
+        assert_eq!(String::from_utf8(output.stderr).unwrap(), "", "{args:?}");
+    }
+}
+
+#[test]
+fn list_is_sorted_complete_json() {
+    let (code, out, err) = run(&["list", "--format", "json"]);
+    assert_eq!((code, err.as_str()), (0, ""));
+    let plugins: Vec<Value> = serde_json::from_str(&out).unwrap();
+    let text = |plugin: &Value, key: &str| plugin[key].as_str().unwrap().to_owned();
+    let names: Vec<(String, String)> = plugins.iter().map(|p| (text(p, "kind"), text(p, "name"))).collect();
+    let mut sorted = names.clone();
+    sorted.sort();
+    sorted.dedup();
+    assert_eq!(names, sorted, "sorted by kind and name, no name twice");
+    for plugin in &plugins {
+        let name = text(plugin, "name");
+        let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || "-_.".contains(c);
+        assert!(!name.is_empty() && name.chars().all(plain), "{plugin}");
+        assert!(text(plugin, "syntax").starts_with(&name), "{plugin}");
+        assert!(!text(plugin, "summary").is_empty() && !text(plugin, "reference").is_empty(), "{plugin}");
+    }
+    let links: Vec<Value> = serde_json::from_str(&run(&["list", "link", "--format", "json"]).1).unwrap();
+    assert_eq!(links.len(), names.iter().filter(|(kind, _)| kind == "link").count());
+}
+
+#[test]
+fn list_prints_a_table_of_every_kind() {
+    let (code, out, err) = run(&["list"]);
+    assert_eq!((code, err.as_str()), (0, ""));
+    let json: Vec<Value> = serde_json::from_str(&run(&["list", "--format", "json"]).1).unwrap();
+    assert_eq!(out.lines().count(), json.len() + 1, "a header and one line per plugin:\n{out}");
+}
+
+#[test]
+fn completions_and_manual_pages_name_every_subcommand() {
+    let (code, script, _) = run(&["generate", "completions", "bash"]);
+    assert_eq!(code, 0);
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("man");
+    let man = ["generate", "man", "--out", out.to_str().unwrap()];
+    assert_eq!(run(&man).0, 0);
+    for command in Cli::command().get_subcommands() {
+        let case = format!("ccmarl,{})", command.get_name());
+        assert!(script.contains(&case), "no {case} in the script");
+        let page = std::fs::read_to_string(out.join(format!("ccmarl-{}.1", command.get_name()))).unwrap();
+        assert!(page.contains(".SH SYNOPSIS"), "{page}");
+    }
+    let (code, _, err) = run(&man);
+    assert_eq!(code, 2, "pages are not replaced without --force");
+    assert!(err.starts_with("error: output exists: give --force to replace it"), "{err}");
+    assert_eq!(run(&["generate", "man", "--force", "--out", out.to_str().unwrap()]).0, 0);
+}
+
+#[test]
+fn help_texts_are_as_agreed() {
+    insta::assert_snapshot!("help", run(&["--help"]).1);
+    for command in Cli::command().get_subcommands() {
+        let name = command.get_name();
+        insta::assert_snapshot!(format!("help-{name}"), run(&[name, "--help"]).1);
+    }
+}
+
+fn readme() -> String {
+    std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/README.md")).unwrap()
+}
+
+#[test]
+fn the_readme_names_every_subcommand_and_no_other() {
+    let readme = readme();
+    let row = |line: &str| line.strip_prefix("| `")?.split_once('`').map(|(name, _)| name.to_owned());
+    let table = readme.split("## Commands").nth(1).unwrap().split("\n## ").next().unwrap();
+    let mut named: Vec<String> = table.lines().filter_map(row).collect();
+    let mut known: Vec<String> = Cli::command().get_subcommands().map(|c| c.get_name().to_owned()).collect();
+    named.sort();
+    known.sort();
+    assert_eq!(named, known);
+}
+
+#[test]
+fn every_command_of_the_readme_parses() {
+    let readme = readme();
+    let lines: Vec<&str> = readme.lines().filter(|line| line.starts_with("ccmarl ")).collect();
+    assert!(lines.len() >= 8, "the tour has gone: {lines:?}");
+    for line in lines {
+        let words = line.split(" #").next().unwrap().split_whitespace();
+        Cli::try_parse_from(words).map_err(|error| format!("{line}\n{error}")).unwrap();
+    }
+}

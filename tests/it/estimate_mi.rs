@@ -1,0 +1,216 @@
+//! `ccmarl estimate-mi` from outside, on tables; and the fixed tables' golden rows.
+
+use std::path::{Path, PathBuf};
+
+use assert_cmd::Command;
+use polars::prelude::{Column, DataFrame, NamedFrom as _, ParquetReader, ParquetWriter, SerReader as _, Series};
+use serde_json::Value;
+
+fn run(args: &[&str]) -> (i32, String, String) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ccmarl"));
+    let output = command.env_remove("COLUMNS").arg("estimate-mi").args(args).output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    (output.status.code().unwrap(), text(output.stdout), text(output.stderr))
+}
+
+fn json(args: &[&str]) -> Vec<Value> {
+    let (code, out, err) = run(&[args, &["--format", "json"]].concat());
+    assert_eq!(code, 0, "{err}");
+    serde_json::from_str(&out).unwrap()
+}
+
+fn dataset(name: &str) -> String {
+    format!("{}/datasets/{name}", env!("CARGO_MANIFEST_DIR"))
+}
+
+fn write(dir: &Path, name: &str, text: &str) -> String {
+    let path = dir.join(name);
+    ccmarl::io::write_atomic(&path, text.as_bytes()).unwrap();
+    path.to_string_lossy().into_owned()
+}
+
+/// 60 rows: t, a, b = a + noise of period 7, g in three groups, s text, c constant.
+fn csv(dir: &Path) -> String {
+    let mut text = "t,a,b,g,s,c\n".to_owned();
+    for i in 0..60 {
+        let (a, noise) = (f64::from(i * 37 % 60), f64::from(i * i % 7));
+        text += &format!("{i},{a},{},{},w{i},1\n", a + noise, i % 12);
+    }
+    write(dir, "table.csv", &text)
+}
+
+#[test]
+fn errors_name_the_remedy_and_have_the_right_exit_code() {
+    let dir = tempfile::tempdir().unwrap();
+    let table = csv(dir.path());
+    let infinite = write(dir.path(), "inf.csv", "a,b\n1,2\n2,inf\n");
+    let hollow = write(dir.path(), "hollow.csv", "a,b\n1,\n,2\n");
+    let empty = write(dir.path(), "empty.csv", "");
+    let broken = write(dir.path(), "broken.parquet", "PAR1 and then nothing of the kind");
+    let missing = dir.path().join("none.csv").to_string_lossy().into_owned();
+    let there = write(dir.path(), "there.json", "kept");
+    let cases: &[(i32, &[&str], &str)] = &[
+        (2, &[&table, "--x", "aa", "--y", "b"], "no column \"aa\": "),
+        (
+            2,
+            &[&table, "--x", "s", "--y", "b"],
+            "column \"s\" holds text, expected integers, floats or booleans; of the columns asked for, b are numeric",
+        ),
+        (2, &[&table], "not a rollout store, and as a table it needs --x and --y"),
+        (2, &[&table, "--x", "a"], "--y"),
+        (2, &[&table, "--group", "g"], "--x"),
+        (
+            2,
+            &[&table, "--x", "a", "--y", "b", "--estimator", "gausian"],
+            "unknown estimator \"gausian\": did you mean gaussian?",
+        ),
+        (2, &[&table, "--x", "a", "--y", "b", "--estimator", "jsd:3"], "takes no value"),
+        (2, &[&table, "--x", "a", "--y", "b", "--delivered"], "--delivered"),
+        (2, &[&table, "--x", "a", "--y", "b", "--out", &there], "output exists: give --force"),
+        (
+            1,
+            &[&table, "--x", "a", "--y", "b", "--out", "x.txt"],
+            "expected a name that ends in .json, .csv or .parquet",
+        ),
+        (1, &[&table, "--x", "c", "--y", "b", "--estimator", "gaussian"], "c is constant, so it can tell nothing"),
+        (
+            1,
+            &[&table, "--x", "a", "--y", "b", "--group", "c", "--estimator", "jsd"],
+            "needs at least 10 episodes to split by episode",
+        ),
+        (1, &[&infinite, "--x", "a", "--y", "b"], "column \"b\", row 2: infinite"),
+        (1, &[&hollow, "--x", "a", "--y", "b"], "no rows: all 2 rows have a missing value in a, b"),
+        (1, &[&empty, "--x", "a", "--y", "b"], "not a readable CSV table"),
+        (1, &[&broken, "--x", "a", "--y", "b"], "not a readable Parquet table"),
+        (1, &[&broken], "not a readable Parquet table"),
+        (1, &[&missing, "--x", "a", "--y", "b"], "no such file or directory"),
+        (1, &[&missing], "no such file or directory"),
+    ];
+    for (code, args, message) in cases {
+        let (found, out, err) = run(args);
+        assert_eq!((found, out.as_str()), (*code, ""), "{args:?}: {err}");
+        assert!(err.contains(message), "{args:?}: {err}");
+        assert!(!err.contains("panicked"), "{args:?}: {err}");
+    }
+    assert_eq!(std::fs::read_to_string(there).unwrap(), "kept");
+}
+
+#[test]
+fn groups_series_and_rows_are_named_in_the_output() {
+    let dir = tempfile::tempdir().unwrap();
+    let table = csv(dir.path());
+    let base = [table.as_str(), "--x", "a", "--y", "b", "--estimator", "gaussian"];
+    for (more, group) in [(&[][..], "row"), (&["--group", "g"], "g"), (&["--time", "t"], "blocks of t")] {
+        let rows = json(&[&base, more].concat());
+        assert_eq!((&rows[0]["group"], &rows[0]["n"]), (&group.into(), &60.into()));
+    }
+    let (_, out, _) = run(&base);
+    assert!(out.contains("each row was taken as independent; give --group or --time"), "{out}");
+    assert!(out.contains("a ; b") && out.contains("gaussian"), "{out}");
+    let (_, out, _) = run(&[&base[..], &["--group", "g"]].concat());
+    assert!(!out.contains("each row was taken"), "{out}");
+}
+
+#[test]
+fn missing_values_are_counted_copies_are_infinite_and_strict_fails_on_warnings() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut text = "a,b,d\n,1,1\n2,NaN,2\n".to_owned();
+    (0..40).for_each(|i| text += &format!("{i}.5,{},{}\n", i * i % 11, 2 * i));
+    let table = write(dir.path(), "gaps.csv", &text);
+    let rows = json(&[&table, "--x", "a", "--y", "b", "--estimator", "gaussian"]);
+    assert_eq!(
+        (&rows[0]["n"], &rows[0]["warnings"][0]),
+        (&40.into(), &"2 of 42 rows left out: a missing value in a, b".into())
+    );
+    let copy = [table.as_str(), "--x", "a", "--y", "d", "--estimator", "gaussian"];
+    assert!(json(&copy)[0]["value"].is_null());
+    let (code, out, err) = run(&[&copy[..], &["--strict"]].concat());
+    assert_eq!(code, 1, "{err}");
+    assert!(out.contains("infinite (copy)") && err.contains("carry warnings, and --strict was given"), "{out}{err}");
+}
+
+#[test]
+fn parquet_with_vectors_and_nulls_reads_as_its_columns_and_the_three_outputs_agree() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("v.parquet");
+    let n = 50_usize;
+    let a: Vec<Option<f32>> = (0..n).map(|i| (i != 3).then_some((i * 7 % n) as f32)).collect();
+    let b: Vec<bool> = (0..n).map(|i| i * 7 % n > 20).collect();
+    let inner: Vec<Series> = (0..n).map(|i| Series::new("".into(), [(i * 7 % n) as f64, (i % 5) as f64])).collect();
+    let columns = vec![Column::new("a".into(), a), Column::new("b".into(), b), Column::new("v".into(), inner)];
+    let mut frame = DataFrame::new(n, columns).unwrap();
+    ParquetWriter::new(std::fs::File::create(&path).unwrap()).finish(&mut frame).unwrap();
+    let file = path.to_string_lossy().into_owned();
+    let out = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let args = [file.as_str(), "--x", "a", "--y", "v,b", "--estimator", "gaussian"];
+    let rows = json(&args);
+    assert_eq!((&rows[0]["n"], &rows[0]["y"]), (&49.into(), &"v,b".into()));
+    for name in ["r.json", "r.csv", "r.parquet"] {
+        let (code, _, err) = run(&[&args[..], &["--out", &out(name)]].concat());
+        assert_eq!(code, 0, "{err}");
+    }
+    let written: Vec<Value> = serde_json::from_slice(&std::fs::read(out("r.json")).unwrap()).unwrap();
+    assert_eq!(written, rows);
+    let keys = rows[0].as_object().unwrap().keys().cloned().collect::<Vec<_>>();
+    let csv = std::fs::read_to_string(out("r.csv")).unwrap();
+    assert_eq!(csv.lines().next().unwrap(), keys.join(","));
+    let frame = ParquetReader::new(std::fs::File::open(PathBuf::from(out("r.parquet"))).unwrap()).finish().unwrap();
+    assert_eq!(frame.get_column_names().iter().map(ToString::to_string).collect::<Vec<_>>(), keys);
+    assert_eq!(frame.height(), 1);
+}
+
+#[test]
+fn a_damaged_parquet_file_is_an_error_and_never_a_panic() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("v.parquet");
+    let a: Vec<f64> = (0..64).map(|i| f64::from(i * 7 % 64)).collect();
+    let mut frame = DataFrame::new(64, vec![Column::new("a".into(), &a), Column::new("b".into(), &a)]).unwrap();
+    let mut bytes = Vec::new();
+    ParquetWriter::new(&mut bytes).finish(&mut frame).unwrap();
+    let options =
+        ccmarl::pairs::TableOptions { x: vec!["a".to_owned()], y: vec!["b".to_owned()], ..Default::default() };
+    let footer = u32::from_le_bytes(bytes[bytes.len() - 8..bytes.len() - 4].try_into().unwrap()) as usize;
+    for at in (bytes.len() - 8 - footer..bytes.len()).step_by(7) {
+        let mut changed = bytes.clone();
+        changed[at] ^= 0x55;
+        ccmarl::io::write_atomic(&path, &changed).unwrap();
+        // some flips change a name or a statistic that nobody reads; whatever comes back, it comes back
+        drop(ccmarl::pairs::table(&path, &options));
+        ccmarl::io::write_atomic(&path, &bytes[..at]).unwrap();
+        assert!(ccmarl::pairs::table(&path, &options).is_err(), "truncated to {at} bytes");
+    }
+}
+
+#[test]
+fn the_fixed_tables_give_their_golden_rows() {
+    // gaussian is exact; trained estimators follow the CPU's kernels, so they are held to 1e-3
+    let golden: Vec<Value> = serde_json::from_slice(&std::fs::read(dataset("tables/iris.mi.json")).unwrap()).unwrap();
+    let table = dataset("tables/iris.csv");
+    let found = json(&[&table, "--x", "petal_length", "--y", "petal_width"]);
+    assert_eq!(found.len(), golden.len());
+    for (found, golden) in found.iter().zip(&golden) {
+        let name = golden["estimator"].as_str().unwrap();
+        let tolerance = if name == "gaussian" { 1e-6 } else { 1e-3 };
+        for (key, expected) in golden.as_object().unwrap() {
+            match expected.as_f64() {
+                Some(expected) if key != "p_value" || name == "gaussian" => {
+                    let value = found[key].as_f64().unwrap();
+                    let allowed =
+                        if key == "n_effective" { 1e-2 * expected } else { tolerance * expected.abs().max(1.0) };
+                    assert!((value - expected).abs() <= allowed, "{name} {key}: {value} against {expected}");
+                }
+                Some(_) => {}
+                None => assert_eq!(&found[key], expected, "{name} {key}"),
+            }
+        }
+    }
+}
+
+#[test]
+fn help_shows_examples() {
+    let (code, out, _) = run(&["--help"]);
+    assert_eq!(code, 0);
+    for part in ["ccmarl estimate-mi data/tag", "--group", "--time", "--strict", "delivered and lost apart"] {
+        assert!(out.contains(part), "{part}");
+    }
+}

@@ -1,0 +1,129 @@
+//! Estimators on data of known information, through the library.
+
+use std::sync::Arc;
+
+use ccmarl::mi::{ESTIMATORS, Estimate, Plan, Protocol, run};
+use ccmarl::registry::{Spec, find};
+use ccmarl::rng::{Seeds, normal};
+use ccmarl::schema::{Columns, Exchange, SampleLabels, Samples};
+
+/// Probe-like episodes of 25 steps: m ~ N(0,1), a = (ρ m + √(1−ρ²) ε, noise).
+fn probe(rho: f64, episodes: usize, seed: u64) -> Samples {
+    let mut rng = Seeds::new(seed).stream("probe");
+    let (mut x, mut y) = (Vec::new(), Vec::new());
+    let n = episodes * 25;
+    for _ in 0..n {
+        let m = normal(&mut rng);
+        x.push(m);
+        y.extend([rho * m + (1.0 - rho * rho).sqrt() * normal(&mut rng), normal(&mut rng)]);
+    }
+    let columns = |data: Vec<f64>, names: &[&str]| {
+        Arc::new(Columns { data, names: names.iter().map(|&n| n.to_owned()).collect() })
+    };
+    Samples {
+        x: columns(x, &["m"]),
+        y: columns(y, &["a0", "a1"]),
+        z: None,
+        starts: (0..=episodes).map(|e| e * 25).collect::<Vec<_>>().into(),
+        rows: (0..n as u32).collect(),
+        exchange: Exchange::Episodes,
+        labels: SampleLabels {
+            x: "m".to_owned(),
+            y: "a".to_owned(),
+            group: "episode".to_owned(),
+            ..Default::default()
+        },
+        notes: Vec::new(),
+    }
+}
+
+fn plan(names: &[&str], permutations: usize, seed: u64) -> Plan {
+    let build = |name: &&str| {
+        let entry = find("estimator", ESTIMATORS, name).unwrap();
+        ((*name).to_owned(), (entry.build)(&Spec::new(name)).unwrap())
+    };
+    Plan { estimators: names.iter().map(build).collect(), protocol: Protocol { permutations }, seed }
+}
+
+fn rows(sets: &[Samples], plan: &Plan) -> Vec<Estimate> {
+    run(sets, plan, &|| ()).into_iter().flat_map(|r| r.rows.unwrap()).collect()
+}
+
+fn mean(rows: &[Estimate], name: &str) -> f64 {
+    let values: Vec<f64> = rows.iter().filter(|r| r.estimator == name).map(|r| r.value).collect();
+    values.iter().sum::<f64>() / values.len() as f64
+}
+
+#[test]
+fn the_probe_is_recovered_on_ten_seeds_with_3000_held_out_samples() {
+    let sets: Vec<Samples> = (0..10).map(|seed| probe(0.75, 420, seed)).collect();
+    let rows = rows(&sets, &plan(&["gaussian", "jsd", "club"], 0, 1));
+    assert!(rows.iter().all(|r| r.n >= 3000), "{}", rows[1].n);
+    for name in ["gaussian", "jsd-plugin"] {
+        let found = mean(&rows, name);
+        assert!((found / 0.4133 - 1.0).abs() < 0.1, "{name}: {found}");
+    }
+    // exact values: 2·JSD, and ρ²/(1 − ρ²)
+    assert!((mean(&rows, "jsd") - 0.2158).abs() < 0.02, "{}", mean(&rows, "jsd"));
+    assert!((mean(&rows, "club") - 1.2857).abs() < 0.15, "{}", mean(&rows, "club"));
+    for name in ["jsd-nwj", "jsd-dv", "jsd-certified"] {
+        let found = mean(&rows, name);
+        assert!(found < 0.4133 + 0.01 && found > 0.2, "{name}: {found}");
+    }
+    assert!(mean(&rows, "club-l1out") > 0.38 && mean(&rows, "club-fit") > 0.3);
+}
+
+#[test]
+fn independent_data_give_zero() {
+    let sets: Vec<Samples> = (0..4).map(|seed| probe(0.0, 420, 50 + seed)).collect();
+    let rows = rows(&sets, &plan(&["gaussian", "jsd", "club"], 0, 1));
+    for row in rows {
+        assert!(row.value.abs() < 0.02, "{}: {}", row.estimator, row.value);
+    }
+}
+
+#[test]
+fn p_values_separate_dependence_from_independence_and_reject_no_more_than_they_should() {
+    let dependent = rows(&[probe(0.3, 100, 1)], &plan(&["gaussian", "jsd", "club"], 99, 1));
+    assert!(dependent.iter().all(|r| r.p_value.unwrap() <= 0.05), "{dependent:?}");
+    let sets: Vec<Samples> = (0..40).map(|seed| probe(0.0, 20, 100 + seed)).collect();
+    let p: Vec<f64> = rows(&sets, &plan(&["gaussian"], 19, 1)).into_iter().map(|r| r.p_value.unwrap()).collect();
+    // 40 draws at 5 %: 7 or more have probability 0.003
+    assert!(p.iter().filter(|&&p| p <= 0.05).count() < 7, "{p:?}");
+}
+
+#[test]
+fn a_trend_that_all_episodes_share_is_no_dependence_for_the_permutation() {
+    // x and y both follow the step, and share nothing else: the value is large, the p-value is not small
+    let mut samples = probe(0.0, 60, 3);
+    let trend = |columns: &Columns| {
+        let width = columns.width();
+        let data = columns.data.iter().enumerate().map(|(i, v)| v + (i / width % 25) as f64).collect();
+        Arc::new(Columns { data, names: columns.names.clone() })
+    };
+    samples.x = trend(&samples.x);
+    samples.y = trend(&samples.y);
+    let found = rows(&[samples], &plan(&["gaussian"], 99, 1));
+    assert!(found[0].value > 1.0 && found[0].p_value.unwrap() > 0.02, "{found:?}");
+}
+
+#[test]
+fn every_estimator_states_its_words_and_refuses_parameters_it_does_not_have() {
+    for entry in ESTIMATORS {
+        assert!(!entry.summary.is_empty() && !entry.reference.is_empty());
+        let error = (entry.build)(&Spec::new(entry.name).with("wrong", 1)).err().unwrap().to_string();
+        assert!(error.starts_with(entry.name) && error.contains("wrong"), "{error}");
+    }
+}
+
+#[test]
+fn too_few_episodes_and_constant_columns_are_errors_of_every_trained_estimator() {
+    let few = probe(0.5, 9, 1);
+    let mut constant = probe(0.5, 20, 1);
+    constant.x = Arc::new(Columns { data: vec![2.5; 500], names: vec!["m".to_owned()] });
+    for result in run(&[few, constant], &plan(&["jsd", "club"], 0, 1), &|| ()) {
+        let error = result.rows.unwrap_err().to_string();
+        let expected = ["needs at least 10 episodes to split by episode", "m is constant, so it can tell nothing"];
+        assert!(expected.iter().any(|e| error.starts_with(e)), "{error}");
+    }
+}
