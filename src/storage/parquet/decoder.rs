@@ -155,13 +155,14 @@ impl Batch {
         let mut rest = self.rest.iter();
         let mut next = |width: usize| if width > 0 { rest.next() } else { None };
         if let Some(array) = next(layout.state_fields.len()) {
-            let (values, at, width) = elements::<Float64Array>(array)?;
-            e.state.extend_from_slice(&values.values()[(at + from) * width..][..n * width]);
+            let (values, width) = elements::<Float64Array>(array)?;
+            let part = values.values().get(from * width..(from + n) * width);
+            e.state.extend_from_slice(part.ok_or("a list column is shorter than its rows")?);
         }
         let floats = |array: Option<&ArrayRef>, n: usize, out: &mut Vec<f32>| -> Result<(), String> {
             if let Some(array) = array {
-                let (values, at, width) = elements::<Float32Array>(array)?;
-                let part = values.values().get((at + from) * width..(at + from + n) * width);
+                let (values, width) = elements::<Float32Array>(array)?;
+                let part = values.values().get(from * width..(from + n) * width);
                 out.extend_from_slice(part.ok_or("a list column is shorter than its rows")?);
             }
             Ok(())
@@ -173,8 +174,8 @@ impl Batch {
             floats(next(a.message), n, &mut m.data)?;
         }
         if let Some(array) = next(layout.communicators().len()) {
-            let (values, at, width) = elements::<BooleanArray>(array)?;
-            e.link.extend(((at + from) * width..(at + from + n) * width).map(|i| values.value(i)));
+            let (values, width) = elements::<BooleanArray>(array)?;
+            e.link.extend((from * width..(from + n) * width).map(|i| values.value(i)));
         }
         for (a, m) in layout.agents.iter().zip(&mut e.actions) {
             floats(next(a.action), acted, &mut m.data)?;
@@ -187,12 +188,12 @@ impl Batch {
     }
 }
 
-/// The elements of a list column, its first row among them, and its width.
-fn elements<A: Array + 'static>(array: &ArrayRef) -> Result<(&A, usize, usize), String> {
+/// The elements of a list column, and its width.
+fn elements<A: Array + 'static>(array: &ArrayRef) -> Result<(&A, usize), String> {
     let list = array.as_any().downcast_ref::<FixedSizeListArray>();
     let values = list.and_then(|l| l.values().as_any().downcast_ref::<A>());
     list.zip(values)
-        .map(|(l, v)| (v, 0, l.value_length() as usize))
+        .map(|(l, v)| (v, l.value_length() as usize))
         .ok_or_else(|| format!("unexpected type {}", array.data_type()))
 }
 

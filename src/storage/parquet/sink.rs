@@ -107,13 +107,10 @@ impl ParquetSink {
         unsealed.sealed_json().map_err(|source| StorageError::Schema { source, path: self.path.clone() })
     }
 
-    fn write_journal(&mut self, batch: &RecordBatch, flush: bool) -> Result<(), StorageError> {
+    fn write_journal(&mut self, batch: &RecordBatch) -> Result<(), StorageError> {
         let path = self.journal_path();
         if let Some(journal) = &mut self.journal {
             journal.write(batch).map_err(|e| refused(e, &path))?;
-            if flush {
-                journal.flush().map_err(|e| refused(e, &path))?;
-            }
         }
         Ok(())
     }
@@ -131,9 +128,9 @@ impl ParquetSink {
         let batch = block.into_batch(&self.schema).map_err(|e| refused(e, &self.path))?;
         if let Some(tail) = tail {
             let tail = tail.into_batch(&self.schema).map_err(|e| refused(e, &self.path))?;
-            self.write_journal(&tail, false)?;
+            self.write_journal(&tail)?;
         } else if whole {
-            self.write_journal(&batch, false)?;
+            self.write_journal(&batch)?;
         }
         self.encoder.send(Job::Rows(batch))
     }
@@ -192,7 +189,7 @@ impl EpisodeSink for ParquetSink {
             let tail = self.block.tail(self.journaled);
             self.journaled = self.block.rows;
             let batch = tail.into_batch(&self.schema).map_err(|e| refused(e, &self.path))?;
-            self.write_journal(&batch, false)?;
+            self.write_journal(&batch)?;
         }
         let path = self.journal_path();
         if let Some(journal) = &mut self.journal {
@@ -235,9 +232,9 @@ impl Drop for ParquetSink {
     /// An unfinished store keeps its journal for recovery, unless it holds nothing.
     fn drop(&mut self) {
         if !self.finished {
-            let stopped = if self.total.episodes > 0 { self.commit().map(drop) } else { Ok(()) };
-            let stopped = stopped.and(self.encoder.join().map(drop));
-            if self.total.episodes == 0 || stopped.is_err() && !self.partial.exists() {
+            self.commit().ok();
+            self.encoder.join().ok();
+            if self.total.episodes == 0 {
                 std::fs::remove_dir_all(&self.partial).ok();
             }
         }
