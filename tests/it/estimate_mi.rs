@@ -114,7 +114,7 @@ fn groups_series_and_rows_are_named_in_the_output() {
 #[test]
 fn missing_values_are_counted_copies_are_infinite_and_strict_fails_on_warnings() {
     let dir = tempfile::tempdir().unwrap();
-    let mut text = "a,b,d\n,1,1\n2,NaN,2\n".to_owned();
+    let mut text = "a,b,d\n,1,1\n2,NaN,3\n".to_owned();
     (0..40).for_each(|i| text += &format!("{i}.5,{},{}\n", i * i % 11, 2 * i));
     let table = write(dir.path(), "gaps.csv", &text);
     let rows = json(&[&table, "--x", "a", "--y", "b", "--estimator", "gaussian"]);
