@@ -229,8 +229,8 @@ impl Actors {
             }
             networks.push(Mlp::new(&widths, Activation::Relu, Activation::Tanh));
         }
-        let builder = VarBuilder::from_buffered_safetensors(bytes, DType::F32, &Device::Cpu)
-            .map_err(|e| e.to_string())?;
+        let builder =
+            VarBuilder::from_buffered_safetensors(bytes, DType::F32, &Device::Cpu).map_err(|e| e.to_string())?;
         let mut params = Vec::new();
         for (name, network) in names.iter().zip(&networks) {
             from_tensors(&builder, &format!("actor.{name}"), network, &mut params).map_err(|e| e.to_string())?;

@@ -206,7 +206,13 @@ impl Maddpg {
         for i in 0..self.actors.len() {
             actor_inputs(&self.actors, i, &batch.next_observations, &batch.next_link, rows, &mut inputs[i]);
             let actions = self.actors.act(&target_actors, i, &inputs[i], rows, &mut actor_tapes[i]);
-            put_actions(joint, actions, widths, self.actors.networks[i].outputs(), widths.action_offset(&self.actors, i));
+            put_actions(
+                joint,
+                actions,
+                widths,
+                self.actors.networks[i].outputs(),
+                widths.action_offset(&self.actors, i),
+            );
         }
         let next_q = self.critic.forward(&self.params.target_critic.read(), joint, rows, critic_tape);
         target.clear();
@@ -260,7 +266,13 @@ impl Maddpg {
         for i in 0..self.actors.len() {
             actor_inputs(&self.actors, i, &batch.next_observations, &batch.next_link, batch.rows, &mut input);
             let actions = self.actors.act(&self.params.target_actors.read(), i, &input, batch.rows, &mut tape);
-            put_actions(&mut joint, actions, widths, self.actors.networks[i].outputs(), widths.action_offset(&self.actors, i));
+            put_actions(
+                &mut joint,
+                actions,
+                widths,
+                self.actors.networks[i].outputs(),
+                widths.action_offset(&self.actors, i),
+            );
         }
         let next_q = self.critic.forward(&self.params.target_critic.read(), &joint, batch.rows, &mut tape);
         let target: Vec<f32> = batch.reward.iter().zip(next_q).map(|(r, q)| r + self.config.gamma * q).collect();
@@ -279,7 +291,13 @@ impl Maddpg {
         for i in 0..self.actors.len() {
             actor_inputs(&self.actors, i, &batch.observations, &batch.link, rows, &mut inputs[i]);
             let actions = self.actors.act(&actor_params, i, &inputs[i], rows, &mut actor_tapes[i]);
-            put_actions(joint, actions, widths, self.actors.networks[i].outputs(), widths.action_offset(&self.actors, i));
+            put_actions(
+                joint,
+                actions,
+                widths,
+                self.actors.networks[i].outputs(),
+                widths.action_offset(&self.actors, i),
+            );
         }
         let critic_params = self.params.critic.read();
         let objective = mean(self.critic.forward(&critic_params, joint, rows, critic_tape));
@@ -296,7 +314,8 @@ impl Maddpg {
             let width = self.actors.networks[i].outputs();
             let at = widths.action_offset(&self.actors, i);
             grad_action.clear();
-            for (grad, row) in grad_joint.chunks_exact(widths.joint()).zip(actor_tapes[i].output().chunks_exact(width)) {
+            for (grad, row) in grad_joint.chunks_exact(widths.joint()).zip(actor_tapes[i].output().chunks_exact(width))
+            {
                 grad_action.extend(grad[at..at + width].iter().zip(row).map(|(g, a)| g + penalty * a));
             }
             let grads = &mut actor_grads[self.actors.offsets[i]..self.actors.offsets[i + 1]];
@@ -320,10 +339,7 @@ struct Widths {
 
 impl Widths {
     fn of(actors: &Actors) -> Self {
-        Self {
-            observations: actors.observation.iter().sum(),
-            actions: actors.networks.iter().map(Mlp::outputs).sum(),
-        }
+        Self { observations: actors.observation.iter().sum(), actions: actors.networks.iter().map(Mlp::outputs).sum() }
     }
 
     fn joint(self) -> usize {
@@ -461,10 +477,14 @@ mod tests {
         for at in [0, learner.actors.offsets[1], learner.actors.offsets[1] - 1, grads.len() - 1, steepest] {
             let mut values = [0.0; 2];
             for (value, step) in values.iter_mut().zip([1e-3f32, -1e-3]) {
-                learner.params.actors.update(|p| {
-                    p.copy_from_slice(&start);
-                    p[at] += step;
-                }).unwrap();
+                learner
+                    .params
+                    .actors
+                    .update(|p| {
+                        p.copy_from_slice(&start);
+                        p[at] += step;
+                    })
+                    .unwrap();
                 *value = objective(&learner);
             }
             let slope = -(values[0] - values[1]) / 2e-3;

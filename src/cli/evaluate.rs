@@ -76,7 +76,13 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
             let rows: Vec<Vec<String>> = summary
                 .iter()
                 .map(|(id, mean, std, loss, n)| {
-                    vec![(*id).to_owned(), format!("{mean:.1}"), format!("{std:.1}"), format!("{:.1} %", 100.0 * loss), n.to_string()]
+                    vec![
+                        (*id).to_owned(),
+                        format!("{mean:.1}"),
+                        format!("{std:.1}"),
+                        format!("{:.1} %", 100.0 * loss),
+                        n.to_string(),
+                    ]
                 })
                 .collect();
             ui::print_table(&["channel", "return", "± over episodes", "messages lost", "episodes"], &rows)?;

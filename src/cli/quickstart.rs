@@ -33,7 +33,9 @@ fn commands(dir: &str) -> Vec<Vec<String>> {
     let mut all = Vec::new();
     let mut add = |words: &str| all.push(words.split(' ').map(|word| word.replace("DIR", dir)).collect());
     for algorithm in ["fc-maddpg", "cc-maddpg"] {
-        add(&format!("train --scenario simple_spread --algorithm {algorithm} --steps 200000 --seed 1 --out DIR/runs/{algorithm}"));
+        add(&format!(
+            "train --scenario simple_spread --algorithm {algorithm} --steps 200000 --seed 1 --out DIR/runs/{algorithm}"
+        ));
     }
     for algorithm in ["fc-maddpg", "cc-maddpg"] {
         let record = format!(
@@ -91,6 +93,9 @@ fn prepare(out: &Path, force: bool) -> anyhow::Result<()> {
         std::fs::remove_dir_all(out).map_err(io::IoError::os("replace", out))?;
     }
     let lines: Vec<String> = commands("DIR").iter().map(|words| format!("ccmarl {}\n", words.join(" "))).collect();
-    io::write_atomic(&out.join(MARKER), format!("made by ccmarl {}:\n{}", env!("CARGO_PKG_VERSION"), lines.concat()).as_bytes())?;
+    io::write_atomic(
+        &out.join(MARKER),
+        format!("made by ccmarl {}:\n{}", env!("CARGO_PKG_VERSION"), lines.concat()).as_bytes(),
+    )?;
     Ok(())
 }

@@ -125,7 +125,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         }
     }
     if report.interrupted {
-        ui::say(&format!("interrupted and saved; go on with: ccmarl train --config {out}/config.toml --out {out} --resume"));
+        ui::say(&format!(
+            "interrupted and saved; go on with: ccmarl train --config {out}/config.toml --out {out} --resume"
+        ));
         return Ok(Outcome::Interrupted);
     }
     ui::say(&format!("next: ccmarl evaluate {out} --suite paper"));

@@ -98,12 +98,7 @@ impl Params {
 ///
 /// # Errors
 /// [`NnError::Candle`].
-pub fn to_tensors(
-    prefix: &str,
-    mlp: &Mlp,
-    params: &[f32],
-    out: &mut BTreeMap<String, Tensor>,
-) -> Result<(), NnError> {
+pub fn to_tensors(prefix: &str, mlp: &Mlp, params: &[f32], out: &mut BTreeMap<String, Tensor>) -> Result<(), NnError> {
     for layer in 0..mlp.layers() {
         let ([outputs, inputs], at) = mlp.weight(layer);
         let weight = Tensor::from_slice(&params[at..at + outputs * inputs], (outputs, inputs), &Device::Cpu)?;

@@ -8,8 +8,8 @@ mod scripted;
 
 use serde_json::{Map, Value};
 
-pub use run::{ActionNoise, Trained};
 pub use rollout::{EpisodeReturn, Options, Recorded, Recording, loss_rate, returns};
+pub use run::{ActionNoise, Trained};
 
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;

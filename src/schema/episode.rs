@@ -106,7 +106,11 @@ impl Episode {
         length("agents".to_owned(), agents, self.actions.len())?;
         length("agents".to_owned(), agents, self.rewards.len())?;
         for (i, agent) in layout.agents.iter().enumerate() {
-            length(format!("observation.{}", agent.name), (t + 1) * agent.observation, self.observations[i].data.len())?;
+            length(
+                format!("observation.{}", agent.name),
+                (t + 1) * agent.observation,
+                self.observations[i].data.len(),
+            )?;
             length(format!("message.{}", agent.name), (t + 1) * agent.message, self.messages[i].data.len())?;
             length(format!("action.{}", agent.name), t * agent.action, self.actions[i].data.len())?;
             length(format!("reward.{}", agent.name), t, self.rewards[i].len())?;
@@ -132,8 +136,10 @@ impl Episode {
         hash.update(b"ccmarl episode v1");
         hash.update((self.steps as u64).to_le_bytes());
         hash.update([u8::from(self.terminal)]);
-        for value in &self.state {
-            hash.update(value.to_le_bytes());
+        if cfg!(target_endian = "little") {
+            hash.update(bytemuck::cast_slice::<f64, u8>(&self.state));
+        } else {
+            self.state.iter().for_each(|v| hash.update(v.to_le_bytes()));
         }
         let floats = |hash: &mut Sha256, data: &[f32]| {
             if cfg!(target_endian = "little") {

@@ -73,7 +73,8 @@ fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
     } else if is_single(path) {
         Ok(Box::new(source::Single::open(path)?))
     } else {
-        let message = "expected a directory, a .parquet or a .mcap file; for a table use `ccmarl estimate-mi FILE --x … --y …`";
+        let message =
+            "expected a directory, a .parquet or a .mcap file; for a table use `ccmarl estimate-mi FILE --x … --y …`";
         Err(StorageError::NotAStore { message: message.to_owned(), path: path.to_owned() })
     }
 }

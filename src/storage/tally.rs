@@ -80,12 +80,20 @@ fn finite(layout: &Layout, e: &Episode) -> Result<(), SchemaError> {
         let message = format!("step {step}, element {element}: found {value}, but a store holds finite numbers only");
         Err(SchemaError::Value { column, message })
     };
-    if let Some(at) = e.state.iter().position(|v| !v.is_finite()) {
+    // The whole column first, without an early exit: this loop runs on vectors of floats.
+    if !e.state.iter().fold(true, |all, v| all & v.is_finite())
+        && let Some(at) = e.state.iter().position(|v| !v.is_finite())
+    {
         return fail("state".to_owned(), layout.state_fields.len(), at, e.state[at]);
     }
-    let check = |kind: &str, agent: &str, width: usize, data: &[f32]| match data.iter().position(|v| !v.is_finite()) {
-        Some(at) => fail(format!("{kind}{agent}"), width, at, f64::from(data[at])),
-        None => Ok(()),
+    let check = |kind: &str, agent: &str, width: usize, data: &[f32]| {
+        if data.iter().fold(true, |all, v| all & v.is_finite()) {
+            return Ok(());
+        }
+        match data.iter().position(|v| !v.is_finite()) {
+            Some(at) => fail(format!("{kind}{agent}"), width, at, f64::from(data[at])),
+            None => Ok(()),
+        }
     };
     check("reward", "", 1, &e.reward)?;
     for (i, a) in layout.agents.iter().enumerate() {

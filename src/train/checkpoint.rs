@@ -146,7 +146,12 @@ pub(super) fn load(trainer: &mut Trainer) -> Result<(), TrainError> {
     trainer
         .replay
         .restore(
-            [floats("replay.observations")?, floats("replay.actions")?, floats("replay.reward")?, floats("replay.bonus")?],
+            [
+                floats("replay.observations")?,
+                floats("replay.actions")?,
+                floats("replay.reward")?,
+                floats("replay.bonus")?,
+            ],
             link.iter().map(|&b| b != 0).collect(),
             counters.replay_pushed,
         )
@@ -173,10 +178,8 @@ pub(super) fn load(trainer: &mut Trainer) -> Result<(), TrainError> {
     if means.len() != 2 * width || rows.len() % (width + 3) != 0 {
         return Err(fail("its metrics have another width".to_owned()));
     }
-    trainer.means = Means {
-        sums: std::array::from_fn(|i| means[i]),
-        counts: std::array::from_fn(|i| means[width + i]),
-    };
+    trainer.means =
+        Means { sums: std::array::from_fn(|i| means[i]), counts: std::array::from_fn(|i| means[width + i]) };
     trainer.metrics = rows
         .chunks_exact(width + 3)
         .map(|r| MetricsRow {

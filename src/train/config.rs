@@ -184,7 +184,10 @@ impl TrainConfig {
     /// [`TrainError::Io`], [`TrainError::Config`].
     pub fn read(path: &Path) -> Result<Self, TrainError> {
         let text = crate::io::read_text(path, LIMIT)?;
-        toml::from_str(&text).map_err(|e| TrainError::Config { message: e.to_string().trim().replace('\n', "; "), path: path.to_owned() })
+        toml::from_str(&text).map_err(|e| TrainError::Config {
+            message: e.to_string().trim().replace('\n', "; "),
+            path: path.to_owned(),
+        })
     }
 
     /// Fills in what preset and scenario decide, and checks every range.
@@ -219,7 +222,8 @@ impl TrainConfig {
 
     fn check(&self) -> Result<(), TrainError> {
         let (m, d, n) = (&self.maddpg, &self.dumie, &self.noise);
-        let positive = |name: &'static str, value: usize| (name, value > 0, format!("expected at least 1, found {value}"));
+        let positive =
+            |name: &'static str, value: usize| (name, value > 0, format!("expected at least 1, found {value}"));
         let unit = |name: &'static str, value: f32| {
             (name, (0.0..=1.0).contains(&value), format!("expected a value in [0, 1], found {value}"))
         };
@@ -253,7 +257,11 @@ impl TrainConfig {
             positive("dumie.negatives", d.negatives),
             positive("dumie.k", d.k),
             ("dumie.batch", d.batch > 1, format!("expected at least 2, found {}", d.batch)),
-            ("dumie.start", (2..=d.ring).contains(&d.start), format!("expected 2 to ring ({}), found {}", d.ring, d.start)),
+            (
+                "dumie.start",
+                (2..=d.ring).contains(&d.start),
+                format!("expected 2 to ring ({}), found {}", d.ring, d.start),
+            ),
         ];
         match rules.into_iter().find(|(_, ok, _)| !ok) {
             None => Ok(()),

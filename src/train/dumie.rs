@@ -147,8 +147,7 @@ impl Dumie {
                     if i == j {
                         continue;
                     }
-                    let estimator =
-                        if episode.delivered(n, row, j, i) { &mut self.jsd } else { &mut self.club };
+                    let estimator = if episode.delivered(n, row, j, i) { &mut self.jsd } else { &mut self.club };
                     let zero = self.config.lost_message == LostMessage::Zero && !episode.delivered(n, row, j, i);
                     let message = if zero { &[][..] } else { episode.messages[sender].row(row) };
                     let action = episode.actions[receiver].row(row);
@@ -236,7 +235,11 @@ impl Dumie {
             let mean = self.values_of(&pairs, delivered, rng);
             if delivered { self.displayed(mean) } else { mean }
         });
-        if delivered { self.jsd.fresh = pairs } else { self.club.fresh = pairs }
+        if delivered {
+            self.jsd.fresh = pairs
+        } else {
+            self.club.fresh = pairs
+        }
         value
     }
 
@@ -263,7 +266,8 @@ impl Dumie {
 
     /// The shaping bonus of each transition of a minibatch, `[B]`.
     pub fn bonus(&mut self, batch: &Batch, rng: &mut Stream, bonus: &mut Vec<f32>) {
-        let (n, o, a) = (self.learners.len(), self.observation.iter().sum::<usize>(), self.action.iter().sum::<usize>());
+        let (n, o, a) =
+            (self.learners.len(), self.observation.iter().sum::<usize>(), self.action.iter().sum::<usize>());
         let mut classes = std::mem::take(&mut self.pairs);
         classes.iter_mut().for_each(Pairs::clear);
         for row in 0..batch.rows {

@@ -46,7 +46,8 @@ impl Replay {
         if capacity < steps || steps == 0 {
             return Err(TrainError::Store(format!("replay {capacity} holds no episode of {steps} steps")));
         }
-        let sum = |width: fn(&crate::schema::AgentSpec) -> usize| learners.iter().map(|&a| width(&layout.agents[a])).sum();
+        let sum =
+            |width: fn(&crate::schema::AgentSpec) -> usize| learners.iter().map(|&a| width(&layout.agents[a])).sum();
         Ok(Self {
             steps,
             capacity: capacity / steps,
@@ -101,7 +102,12 @@ impl Replay {
             self.reward.resize((slot + 1) * self.steps, 0.0);
             self.bonus.resize((slot + 1) * self.steps, 0.0);
         }
-        interleave(&mut self.observations[slot * rows * o..(slot + 1) * rows * o], o, &self.learners, &episode.observations);
+        interleave(
+            &mut self.observations[slot * rows * o..(slot + 1) * rows * o],
+            o,
+            &self.learners,
+            &episode.observations,
+        );
         interleave(
             &mut self.actions[slot * self.steps * a..(slot + 1) * self.steps * a],
             a,
@@ -111,7 +117,11 @@ impl Replay {
         self.link[slot * rows * l..(slot + 1) * rows * l].copy_from_slice(&episode.link);
         let range = slot * self.steps..(slot + 1) * self.steps;
         self.reward[range.clone()].copy_from_slice(&episode.reward);
-        if bonus.is_empty() { self.bonus[range].fill(0.0) } else { self.bonus[range].copy_from_slice(bonus) }
+        if bonus.is_empty() {
+            self.bonus[range].fill(0.0)
+        } else {
+            self.bonus[range].copy_from_slice(bonus)
+        }
         self.pushed += 1;
         Ok(())
     }
@@ -139,7 +149,13 @@ impl Replay {
     pub fn sample<R: Rng + ?Sized>(&self, rng: &mut R, rows: usize, batch: &mut Batch) {
         let [o, a, l] = self.widths;
         batch.rows = rows;
-        for buffer in [&mut batch.observations, &mut batch.next_observations, &mut batch.actions, &mut batch.reward, &mut batch.bonus] {
+        for buffer in [
+            &mut batch.observations,
+            &mut batch.next_observations,
+            &mut batch.actions,
+            &mut batch.reward,
+            &mut batch.bonus,
+        ] {
             buffer.clear();
         }
         batch.link.clear();

@@ -107,8 +107,7 @@ impl Trainer {
         let replay = Replay::new(&layout, scenario.steps(), config.replay)?;
         let weights = config.weights();
         let shaped = weights.iter().any(|&w| w > 0.0) && learners.len() > 1;
-        let dumie =
-            if shaped { Some(Dumie::new(&layout, config.dumie.clone(), weights, &seeds)?) } else { None };
+        let dumie = if shaped { Some(Dumie::new(&layout, config.dumie.clone(), weights, &seeds)?) } else { None };
         Ok(Self {
             config,
             dir: dir.to_owned(),
@@ -131,7 +130,8 @@ impl Trainer {
 
     /// The manifest of a store of this run's rollouts.
     pub fn manifest(&self) -> Manifest {
-        let policy = serde_json::json!({"name": "training", "algorithm": self.config.algorithm, "steps": self.config.steps});
+        let policy =
+            serde_json::json!({"name": "training", "algorithm": self.config.algorithm, "steps": self.config.steps});
         let (scenario, link) = (self.scenario.parameters().into(), self.prior.parameters().into());
         Manifest::new(self.config.seed, scenario, link, policy, &self.layout)
     }
@@ -161,10 +161,19 @@ impl Trainer {
             let name = |agents: &[crate::schema::AgentSpec]| {
                 agents.get(at).map_or_else(
                     || "nobody".to_owned(),
-                    |a| format!("{} (observation {}, message {}, action {})", a.name, a.observation, a.message, a.action),
+                    |a| {
+                        format!(
+                            "{} (observation {}, message {}, action {})",
+                            a.name, a.observation, a.message, a.action
+                        )
+                    },
                 )
             };
-            return Err(TrainError::Store(format!("agent {at} is {} here and {} in the store", name(own), name(other))));
+            return Err(TrainError::Store(format!(
+                "agent {at} is {} here and {} in the store",
+                name(own),
+                name(other)
+            )));
         }
         let mut episodes = 0;
         while let Some(episode) = source.next_episode()? {
@@ -226,9 +235,12 @@ impl Trainer {
         self.bonus.clear();
         if let Some(dumie) = &mut self.dumie {
             let found = dumie.train(&mut rng, report)?;
-            for (name, value) in
-                [("jsd", found.jsd), ("jsd_heldout", found.jsd_heldout), ("club", found.club), ("club_heldout", found.club_heldout)]
-            {
+            for (name, value) in [
+                ("jsd", found.jsd),
+                ("jsd_heldout", found.jsd_heldout),
+                ("club", found.club),
+                ("club_heldout", found.club_heldout),
+            ] {
                 self.means.add(name, value);
             }
             match self.config.dumie.shaping {

@@ -51,7 +51,8 @@ pub(super) fn event_file(rows: &[(i64, Vec<(&str, f64)>)]) -> Vec<u8> {
     record(&version, &mut out);
     for (step, values) in rows {
         let value = values.iter().map(|&(tag, v)| Scalar { tag: tag.to_owned(), simple_value: v as f32 }).collect();
-        let event = Event { wall_time: *step as f64, step: *step, file_version: None, summary: Some(Summary { value }) };
+        let event =
+            Event { wall_time: *step as f64, step: *step, file_version: None, summary: Some(Summary { value }) };
         record(&event, &mut out);
     }
     out

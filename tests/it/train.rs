@@ -70,7 +70,8 @@ fn a_resumed_run_refuses_a_changed_configuration_and_names_the_difference() {
     run(config("maddpg", 500), &path, &Options::default());
     let mut changed = config("maddpg", 500);
     changed.maddpg.gamma = 0.9;
-    let error = train(changed, &path, &Options { resume: true, ..Options::default() }, &mut |_| {}, &AtomicBool::new(false));
+    let error =
+        train(changed, &path, &Options { resume: true, ..Options::default() }, &mut |_| {}, &AtomicBool::new(false));
     let error = error.unwrap_err().to_string();
     assert!(error.contains("the configuration changed") && error.contains("gamma = 0.9"), "{error}");
 }
@@ -78,7 +79,9 @@ fn a_resumed_run_refuses_a_changed_configuration_and_names_the_difference() {
 #[test]
 fn a_store_of_the_runs_own_rollouts_gives_the_next_critic_loss_of_the_replay_in_memory() {
     let dir = tempfile::tempdir().unwrap();
-    for (form, algorithm, steps) in [("s", "cc-maddpg", 2000), ("s.parquet", "maddpg", 900), ("s.mcap", "cc-maddpg", 2000)] {
+    for (form, algorithm, steps) in
+        [("s", "cc-maddpg", 2000), ("s.parquet", "maddpg", 900), ("s.mcap", "cc-maddpg", 2000)]
+    {
         let (path, store) = (dir.path().join(format!("run-{form}")), dir.path().join(form));
         let report = run(config(algorithm, steps), &path, &Options { record: Some(&store), ..Options::default() });
         // the same networks, but a replay filled from the store
@@ -118,7 +121,8 @@ fn a_run_that_diverges_stops_and_names_the_step() {
     let dir = tempfile::tempdir().unwrap();
     let mut wild = config("maddpg", 5000);
     wild.maddpg.critic_learning_rate = 1e30;
-    let error = train(wild, &dir.path().join("a"), &Options::default(), &mut |_| {}, &AtomicBool::new(false)).unwrap_err();
+    let error =
+        train(wild, &dir.path().join("a"), &Options::default(), &mut |_| {}, &AtomicBool::new(false)).unwrap_err();
     assert!(error.to_string().contains("diverged at step 1"), "{error}");
 }
 

@@ -176,7 +176,8 @@ impl EpisodeSource for McapSource {
         let end = end.unwrap_or_default();
         episode.steps = rows.saturating_sub(1);
         if end.index != index || end.steps.checked_add(1) != Some(rows as u64) || end.terminal != episode.terminal {
-            let message = format!("episode {index} of {rows} rows: its end says episode {} of {} steps", end.index, end.steps);
+            let message =
+                format!("episode {index} of {rows} rows: its end says episode {} of {} steps", end.index, end.steps);
             return Err(damaged(message));
         }
         let hash = self.total.check(&self.layout, &episode);
@@ -205,7 +206,11 @@ fn add(layout: &Layout, e: &mut Episode, rows: &mut usize, row: proto::Step) -> 
     }
     for (spec, agent) in layout.agents.iter().zip(&row.agents) {
         let acts = if row.is_last { 0 } else { spec.action };
-        let widths = [(agent.observation.len(), spec.observation), (agent.message.len(), spec.message), (agent.action.len(), acts)];
+        let widths = [
+            (agent.observation.len(), spec.observation),
+            (agent.message.len(), spec.message),
+            (agent.action.len(), acts),
+        ];
         if agent.name != spec.name || widths.iter().any(|(a, b)| a != b) || agent.reward.is_some() == row.is_last {
             return Err(format!("{}: agent {:?} does not fit the manifest's {:?}", place(), agent.name, spec.name));
         }
@@ -240,14 +245,12 @@ fn scan(path: &Path) -> Result<Option<String>, Stop> {
     let mut records = Records::open(path, options).map_err(Stop::Error)?;
     records.each(|opcode, body| {
         match opcode {
-            op::METADATA | op::DATA_END | op::FOOTER => {
-                match parse_record(opcode, body).map_err(|e| e.to_string())? {
-                    Record::Metadata(mut m) if m.name == MANIFEST_RECORD => manifest = m.metadata.remove(JSON_KEY),
-                    Record::DataEnd(end) if end.data_section_crc == 0 => return Err("no checksum of the data".to_owned()),
-                    Record::Footer(end) if end.summary_crc == 0 => return Err("no checksum of the summary".to_owned()),
-                    _ => {}
-                }
-            }
+            op::METADATA | op::DATA_END | op::FOOTER => match parse_record(opcode, body).map_err(|e| e.to_string())? {
+                Record::Metadata(mut m) if m.name == MANIFEST_RECORD => manifest = m.metadata.remove(JSON_KEY),
+                Record::DataEnd(end) if end.data_section_crc == 0 => return Err("no checksum of the data".to_owned()),
+                Record::Footer(end) if end.summary_crc == 0 => return Err("no checksum of the summary".to_owned()),
+                _ => {}
+            },
             _ => {}
         }
         Ok(false)

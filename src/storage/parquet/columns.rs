@@ -13,10 +13,13 @@ use parquet::file::metadata::SortingColumn;
 use parquet::file::properties::{EnabledStatistics, WriterProperties};
 use parquet::schema::types::ColumnPath;
 
-use crate::schema::{Episode, Layout};
+use crate::schema::{AgentSpec, Episode, Layout};
 
 /// Name of the elements of a list, as pyarrow and the Parquet standard write it.
 const ELEMENT: &str = "element";
+
+/// Values that the encoder takes at once; the crate's 1024 costs more calls.
+const WRITE_BATCH: usize = 1 << 16;
 
 /// The Arrow schema of a layout. Columns of width 0 are left out: some readers cannot open them.
 pub(super) fn schema(layout: &Layout) -> SchemaRef {
@@ -71,6 +74,7 @@ pub(super) fn properties(schema: &Schema) -> WriterProperties {
         .set_dictionary_enabled(false)
         .set_statistics_enabled(EnabledStatistics::None)
         .set_max_row_group_row_count(None)
+        .set_write_batch_size(WRITE_BATCH)
         .set_sorting_columns(Some(
             [0, 1].map(|column_idx| SortingColumn { column_idx, descending: false, nulls_first: false }).to_vec(),
         ));
@@ -94,7 +98,7 @@ pub(super) fn properties(schema: &Schema) -> WriterProperties {
 }
 
 /// A block of whole episodes as columns.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub(super) struct Block {
     /// Rows held.
     pub(super) rows: usize,
@@ -113,15 +117,26 @@ pub(super) struct Block {
 }
 
 impl Block {
-    /// An empty block for this layout.
-    pub(super) fn new(layout: &Layout) -> Self {
-        let columns = vec![Vec::new(); layout.agents.len()];
+    /// An empty block for this layout with room for `rows`.
+    pub(super) fn new(layout: &Layout, rows: usize) -> Self {
+        let n = layout.communicators().len();
+        let columns = |width: fn(&AgentSpec) -> usize| {
+            layout.agents.iter().map(|a| Vec::with_capacity(rows * width(a))).collect()
+        };
         Self {
-            observations: columns.clone(),
-            messages: columns.clone(),
-            actions: columns.clone(),
-            rewards: columns,
-            ..Self::default()
+            rows: 0,
+            episode: Vec::with_capacity(rows),
+            step: Vec::with_capacity(rows),
+            first: Vec::with_capacity(rows),
+            last: Vec::with_capacity(rows),
+            terminal: Vec::with_capacity(rows),
+            state: Vec::with_capacity(rows * layout.state_fields.len()),
+            observations: columns(|a| a.observation),
+            messages: columns(|a| a.message),
+            link: Vec::with_capacity(rows * n * n),
+            actions: columns(|a| a.action),
+            reward: Vec::with_capacity(rows),
+            rewards: columns(|_| 1),
         }
     }
 

@@ -111,7 +111,9 @@ impl Batch {
             let nullable = name.starts_with("action.") || name.starts_with("reward");
             if let Some(row) = (0..batch.num_rows()).find(|&r| nullable && array.is_null(r) != last.value(r)) {
                 let step = typed::<Int32Array>(&sorted[1])?.value(row);
-                return Err(format!("column {name}: step {step}: null is for the last row of an episode, and only there"));
+                return Err(format!(
+                    "column {name}: step {step}: null is for the last row of an episode, and only there"
+                ));
             }
             if let Some(list) = array.as_any().downcast_ref::<FixedSizeListArray>()
                 && list.values().null_count() > 0
@@ -134,7 +136,9 @@ impl Batch {
             let (number, step) = (self.episode.value(r), self.step.value(r));
             if number != e.index as i64 || i64::from(step) != *rows as i64 {
                 let expected = format!("expected episode {} step {rows}", e.index);
-                return Err(format!("{expected}, found episode {number} step {step}: rows are missing, doubled or unsorted"));
+                return Err(format!(
+                    "{expected}, found episode {number} step {step}: rows are missing, doubled or unsorted"
+                ));
             }
             if self.first.value(r) != (step == 0) {
                 return Err(format!("column is_first: episode {number} step {step} has {}", self.first.value(r)));

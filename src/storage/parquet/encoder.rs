@@ -149,7 +149,9 @@ fn refused(error: ParquetError, path: &Path) -> StorageError {
     match error {
         ParquetError::External(source) => match source.downcast::<std::io::Error>() {
             Ok(source) => IoError::os("write", path)(*source).into(),
-            Err(other) => StorageError::Damaged { message: format!("could not be encoded: {other}"), path: path.to_owned() },
+            Err(other) => {
+                StorageError::Damaged { message: format!("could not be encoded: {other}"), path: path.to_owned() }
+            }
         },
         other => IoError::os("write", path)(std::io::Error::other(other.to_string())).into(),
     }

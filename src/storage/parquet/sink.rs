@@ -69,7 +69,7 @@ impl ParquetSink {
             single,
             manifest: manifest.clone(),
             schema,
-            block: Block::new(&layout),
+            block: Block::new(&layout, 0),
             layout,
             journaled: 0,
             journal: None,
@@ -123,7 +123,8 @@ impl ParquetSink {
         if self.block.rows == 0 {
             return Ok(());
         }
-        let block = std::mem::replace(&mut self.block, Block::new(&self.layout));
+        let next = Block::new(&self.layout, self.block.rows + self.block.rows / 64);
+        let block = std::mem::replace(&mut self.block, next);
         let from = std::mem::take(&mut self.journaled);
         let tail = (from > 0 && from < block.rows).then(|| block.tail(from));
         let whole = from == 0;

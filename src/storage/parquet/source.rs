@@ -29,7 +29,8 @@ impl Parts {
     pub(super) fn open(directory: &Path) -> Result<Self, StorageError> {
         let path = directory.join(MANIFEST_FILE);
         if !path.exists() {
-            let message = format!("the directory has no {MANIFEST_FILE}: give a directory that `ccmarl record` finished");
+            let message =
+                format!("the directory has no {MANIFEST_FILE}: give a directory that `ccmarl record` finished");
             return Err(StorageError::NotAStore { message, path: directory.to_owned() });
         }
         let text = io::read_text(&path, MANIFEST_LIMIT)?;
@@ -44,7 +45,8 @@ impl Parts {
             next = to;
             let file = directory.join(&part.file);
             if !file.is_file() {
-                let message = format!("part {} of episodes {from} to {} is missing: copy the store again", part.file, to - 1);
+                let message =
+                    format!("part {} of episodes {from} to {} is missing: copy the store again", part.file, to - 1);
                 return Err(StorageError::Damaged { message, path: directory.to_owned() });
             }
         }
@@ -53,7 +55,14 @@ impl Parts {
             return Err(StorageError::Damaged { message, path });
         }
         let layout = manifest.layout();
-        Ok(Self { directory: directory.to_owned(), manifest, layout, next_part: 0, current: None, total: Tally::default() })
+        Ok(Self {
+            directory: directory.to_owned(),
+            manifest,
+            layout,
+            next_part: 0,
+            current: None,
+            total: Tally::default(),
+        })
     }
 
     /// Checks the digest of the next part and opens it; false when there is none.
@@ -65,12 +74,14 @@ impl Parts {
         let size = std::fs::metadata(&path).map_err(IoError::os("read", &path))?.len();
         let (expected, [from, to]) = (part.bytes, part.episodes);
         if size < expected {
-            let message = format!("cut short, {size} of {expected} bytes (episodes {from} to {}): copy the store again", to - 1);
+            let message =
+                format!("cut short, {size} of {expected} bytes (episodes {from} to {}): copy the store again", to - 1);
             return Err(StorageError::Damaged { message, path });
         }
         let (sha256, bytes) = io::sha256_file(&path)?;
         if sha256 != part.sha256 || bytes != expected {
-            let message = format!("the bytes changed since it was written (episodes {from} to {}): copy the store again", to - 1);
+            let message =
+                format!("the bytes changed since it was written (episodes {from} to {}): copy the store again", to - 1);
             return Err(StorageError::Damaged { message, path });
         }
         self.current = Some((Decoder::open(&path, &self.layout)?, Tally::default()));
@@ -215,7 +226,8 @@ fn check_file(path: &Path) -> Result<(), StorageError> {
         position += n as u64;
     }
     if hex(&hash.finalize()).as_bytes() != &text[at..at + 64] {
-        let message = format!("its bytes do not have the digest in its {FILE_SHA256_KEY}: they changed since it was written");
+        let message =
+            format!("its bytes do not have the digest in its {FILE_SHA256_KEY}: they changed since it was written");
         return Err(StorageError::Damaged { message, path: path.to_owned() });
     }
     Ok(())
