@@ -8,13 +8,34 @@ use std::path::{Path, PathBuf};
 
 use candle_core::{DType, Device};
 use candle_nn::VarBuilder;
+use serde::{Deserialize, Serialize};
 
 use crate::nn::{Activation, Mlp, NnError, Tape, from_tensors, to_tensors};
 use crate::rng::Stream;
 use crate::schema::AgentSpec;
 
 /// Version of the actor file.
-const FILE_VERSION: &str = "1";
+const FILE_VERSION: u32 = 1;
+
+/// Metadata key that holds the [`Header`] as JSON.
+const HEADER: &str = "ccmarl.actors";
+
+/// What a reader of the actor file must know beside the tensors.
+#[derive(Serialize, Deserialize)]
+struct Header {
+    version: u32,
+    learners: Vec<String>,
+    observation: Vec<usize>,
+    messages: bool,
+    hidden_activation: String,
+    output_activation: String,
+}
+
+impl Header {
+    fn to_json(&self) -> Result<String, NnError> {
+        serde_json::to_string(self).map_err(|e| candle_core::Error::Msg(e.to_string()).into())
+    }
+}
 
 /// What goes wrong with a trained policy on disk.
 #[derive(Debug, thiserror::Error)]
@@ -148,15 +169,16 @@ impl Actors {
         for (i, network) in self.networks.iter().enumerate() {
             to_tensors(&format!("actor.{}", self.names[i]), network, self.slice(params, i), &mut tensors)?;
         }
-        let join = |v: Vec<String>| v.join(",");
-        let metadata = [
-            ("ccmarl.actors".to_owned(), FILE_VERSION.to_owned()),
-            ("hidden_activation".to_owned(), "relu".to_owned()),
-            ("output_activation".to_owned(), "tanh".to_owned()),
-            ("learners".to_owned(), join(self.names.clone())),
-            ("observation".to_owned(), join(self.observation.iter().map(ToString::to_string).collect())),
-            ("messages".to_owned(), if self.messages { "observation" } else { "off" }.to_owned()),
-        ];
+        let header = Header {
+            version: FILE_VERSION,
+            learners: self.names.clone(),
+            observation: self.observation.clone(),
+            messages: self.messages,
+            hidden_activation: "relu".to_owned(),
+            output_activation: "tanh".to_owned(),
+        };
+        // one key only: the crate keeps metadata in a hash map, whose order would change the bytes
+        let metadata = [(HEADER.to_owned(), header.to_json()?)];
         Ok(safetensors::serialize(tensors, Some(metadata.into_iter().collect()))?)
     }
 
@@ -180,13 +202,12 @@ impl Actors {
     fn from_bytes(bytes: Vec<u8>) -> Result<(Self, Vec<f32>), String> {
         let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).map_err(|e| e.to_string())?;
         let metadata = header.metadata().clone().unwrap_or_default();
-        let key = |k: &str| metadata.get(k).ok_or_else(|| format!("the metadata key {k:?} is missing"));
-        if key("ccmarl.actors")? != FILE_VERSION {
-            return Err(format!("actor file version {:?} is not {FILE_VERSION:?}", metadata.get("ccmarl.actors")));
+        let json = metadata.get(HEADER).ok_or_else(|| format!("the metadata key {HEADER:?} is missing"))?;
+        let Header { version, learners: names, observation, messages, .. } =
+            serde_json::from_str(json).map_err(|e| format!("the metadata key {HEADER:?}: {e}"))?;
+        if version != FILE_VERSION {
+            return Err(format!("actor file version {version} is not {FILE_VERSION}"));
         }
-        let names: Vec<String> = key("learners")?.split(',').map(ToOwned::to_owned).collect();
-        let observation: Vec<usize> = key("observation")?.split(',').filter_map(|w| w.parse().ok()).collect();
-        let messages = key("messages")? == "observation";
         if names.len() != observation.len() {
             return Err("as many observation widths as learners are needed".to_owned());
         }
@@ -279,7 +300,7 @@ mod tests {
         let actors = Actors::new(&agents, &[8, 8], true);
         let params = actors.init(&mut Seeds::new(1).stream("actors"));
         let bytes = actors.to_bytes(&params).unwrap();
-        assert_eq!(bytes, actors.to_bytes(&params).unwrap());
+        assert!(bytes == actors.to_bytes(&params).unwrap());
         let (read, again) = Actors::from_bytes(bytes.clone()).unwrap();
         assert_eq!((again, read.networks), (params, actors.networks.clone()));
         for cut in [0, 7, 8, 100, bytes.len() - 1] {

@@ -76,6 +76,9 @@ pub(super) struct Args {
     strict: bool,
 }
 
+/// A job that gave no rows, and why.
+type Failure = (Job, mi::MiError);
+
 /// A form of output file.
 type Write = fn(&[Estimate]) -> Result<Vec<u8>, String>;
 
@@ -150,7 +153,7 @@ fn samples(args: &Args) -> Result<Vec<Samples>, Error> {
 }
 
 /// All rows, and the jobs that gave none; an error when no job gave any.
-fn split(results: Vec<JobResult>) -> Result<(Vec<Estimate>, Vec<(Job, mi::MiError)>), Error> {
+fn split(results: Vec<JobResult>) -> Result<(Vec<Estimate>, Vec<Failure>), Error> {
     let (mut rows, mut failures) = (Vec::new(), Vec::new());
     for JobResult { job, rows: result } in results {
         match result {

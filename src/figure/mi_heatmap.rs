@@ -68,7 +68,7 @@ fn render(data: &Data, target: Target<'_>) -> Result<(), FigureError> {
     style::render(&Figure { data, panels, senders, receivers, low, high, wide, tall }, target)
 }
 
-fn distinct<'a>(data: &'a Data, of: fn(&Cell) -> &String) -> Vec<&'a str> {
+fn distinct(data: &Data, of: fn(&Cell) -> &String) -> Vec<&str> {
     let mut names: Vec<&str> = Vec::new();
     for cell in &data.cells {
         if !names.contains(&of(cell).as_str()) {
@@ -148,7 +148,7 @@ impl Figure<'_> {
         }
         let style = style::text(style::TICK, style::INK, HPos::Left, VPos::Center);
         for (value, y) in
-            [(self.high, ABOVE), ((self.high + self.low) / 2.0, ABOVE + down / 2), (self.low, ABOVE + down)]
+            [(self.high, ABOVE), (self.high.midpoint(self.low), ABOVE + down / 2), (self.low, ABOVE + down)]
         {
             area.draw_text(&style::number(value, 2), &style, (left + 48, y))?;
         }

@@ -5,9 +5,9 @@
 //!
 //! # Definition
 //!
-//! `club` = E_p\[ln q(y|x)\] − E_q\[ln q(y|x)\], the second mean over the product of the margins; q is a diagonal Gaussian
-//! whose mean and log-variance are perceptrons. `club-l1out` = E\[ln q(y_i|x_i) − ln mean_{j≠i} q(y_i|x_j)\], the
-//! leave-one-out bound. `club-fit` = E_p\[ln q(y|x) − ln r(y)\], r the Gaussian margin of the training part: how good q is.
+//! `club` = `E_p`\[ln q(y|x)\] − `E_q`\[ln q(y|x)\], the second mean over the product of the margins; q is a diagonal Gaussian
+//! whose mean and log-variance are perceptrons. `club-l1out` = E\[ln `q(y_i|x_i)` − ln mean_{j≠i} `q(y_i|x_j)`\], the
+//! leave-one-out bound. `club-fit` = `E_p`\[ln q(y|x) − ln r(y)\], r the Gaussian margin of the training part: how good q is.
 //!
 //! # Shapes and units
 //!
@@ -15,7 +15,7 @@
 //!
 //! # Parameters
 //!
-//! None. Networks: two ReLU layers of 64, log-variance within ±10; Adam 2e-3 falling to 0, weight decay 2.0, at most 600 steps of 256
+//! None. Networks: two `ReLU` layers of 64, log-variance within ±10; Adam 2e-3 falling to 0, weight decay 2.0, at most 600 steps of 256
 //! pairs, stopped on the validation episodes.
 //!
 //! # When it fails
@@ -124,7 +124,7 @@ impl Estimator for Club {
         if fit_gain.mean < -0.01 && fit_gain.high < 0.0 {
             warnings.push(format!("poor q: {:.3} nats worse than the margin on held-out episodes", -fit_gain.mean));
         }
-        let p = held.p_value(samples, &data, protocol, seeds);
+        let p = held.p_value(samples, &data, *protocol, seeds);
         let rows = [
             ("club", Kind::UpperBound, bound),
             ("club-l1out", Kind::UpperBound, leave_one_out),
@@ -188,7 +188,7 @@ impl Held {
         at..at + self.width
     }
 
-    /// vCLUB per test sample when row `rows[i]`'s x stands beside y_i.
+    /// vCLUB per test sample when row `rows[i]`'s x stands beside `y_i`.
     fn contributions(&self, rows: &[u32]) -> Vec<f64> {
         let n = rows.len() as f64;
         let value = |(y, &r): (&[f32], &u32)| {
@@ -247,7 +247,7 @@ impl Held {
         values
     }
 
-    fn p_value(&self, samples: &Samples, data: &Prepared, protocol: &Protocol, seeds: &Seeds) -> Option<f64> {
+    fn p_value(&self, samples: &Samples, data: &Prepared, protocol: Protocol, seeds: &Seeds) -> Option<f64> {
         let statistic = |rows: &[u32]| self.contributions(rows).iter().sum::<f64>();
         let mut rng = seeds.stream("null");
         let null: Vec<f64> = (0..protocol.permutations)

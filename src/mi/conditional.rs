@@ -39,12 +39,12 @@ impl ConditionalTape {
 }
 
 impl GaussianConditional {
-    /// The parent code's networks: one hidden ReLU layer of 32 each, log-variance in (−1, 1).
+    /// The parent code's networks: one hidden `ReLU` layer of 32 each, log-variance in (−1, 1).
     pub fn paper(x_width: usize, y_width: usize) -> Self {
         Self::new(&[x_width, 32, y_width], 1.0)
     }
 
-    /// The networks of `estimate-mi`: two hidden ReLU layers of 64 each, log-variance in (−10, 10).
+    /// The networks of `estimate-mi`: two hidden `ReLU` layers of 64 each, log-variance in (−10, 10).
     pub fn deep(x_width: usize, y_width: usize) -> Self {
         Self::new(&[x_width, 64, 64, y_width], 10.0)
     }

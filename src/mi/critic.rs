@@ -18,9 +18,9 @@ pub struct Separable {
 /// What scoring leaves for the backward pass; reused, so that passes allocate nothing once it is warm.
 #[derive(Clone, Debug, Default)]
 pub struct CriticTape {
-    /// Scores of the pairs (x_i, y_i), `[n]`.
+    /// Scores of the pairs (`x_i`, `y_i`), `[n]`.
     pub positive: Vec<f32>,
-    /// Scores of the pairs (x_i, y_j) with j = negatives\[i, k\], `[n, k]`.
+    /// Scores of the pairs (`x_i`, `y_j`) with j = negatives\[i, k\], `[n, k]`.
     pub negative: Vec<f32>,
     negatives: Vec<u32>,
     x: Tape,
@@ -30,13 +30,13 @@ pub struct CriticTape {
 }
 
 impl Separable {
-    /// The paper's critic: one layer of 32 and LeakyReLU on either side.
+    /// The paper's critic: one layer of 32 and `LeakyReLU` on either side.
     pub fn paper(x_width: usize, y_width: usize) -> Self {
         let side = |width| Mlp::new(&[width, 32], Activation::LeakyRelu, Activation::LeakyRelu);
         Self { x: side(x_width), y: side(y_width) }
     }
 
-    /// The critic of `estimate-mi`: two ReLU layers of 64 and a linear embedding of 32 on either side.
+    /// The critic of `estimate-mi`: two `ReLU` layers of 64 and a linear embedding of 32 on either side.
     pub fn deep(x_width: usize, y_width: usize) -> Self {
         let side = |width| Mlp::new(&[width, 64, 64, 32], Activation::Relu, Activation::Identity);
         Self { x: side(x_width), y: side(y_width) }

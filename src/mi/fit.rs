@@ -85,7 +85,9 @@ pub(super) fn fit<M: Model>(model: &mut M, data: &Prepared, seeds: &Seeds) -> Op
         let rate = LEARNING_RATE * (1.0 - step as f32 / STEPS as f32);
         adam.config.learning_rate = rate;
         adam.step(&mut params, &grads);
-        params.iter_mut().for_each(|p| *p *= 1.0 - rate * M::DECAY);
+        for p in &mut params {
+            *p *= 1.0 - rate * M::DECAY;
+        }
     }
     best
 }

@@ -5,8 +5,8 @@
 //!
 //! # Definition
 //!
-//! I = ½ \[ln |S_x| + ln |S_y| − ln |S_xy|\] with S the sample covariances, less its bias for normal samples,
-//! ½ \[b(d_x) + b(d_y) − b(d_x + d_y)\], b(d) = Σ_{i=1..d} ψ((n − i)/2), ψ the digamma function.
+//! I = ½ \[ln |`S_x`| + ln |`S_y`| − ln |`S_xy`|\] with S the sample covariances, less its bias for normal samples,
+//! ½ \[`b(d_x)` + `b(d_y)` − `b(d_x` + `d_y`)\], b(d) = Σ_{i=1..d} ψ((n − i)/2), ψ the digamma function.
 //!
 //! # Shapes and units
 //!
@@ -86,7 +86,9 @@ impl Estimator for Gaussian {
             parts[group].add_row(&row);
         }
         let mut total = Moments::new(dx + dy);
-        parts.iter().for_each(|p| total.add(p, 1.0));
+        for part in &parts {
+            total.add(part, 1.0);
+        }
         warnings.extend(tied(samples));
         let value = information(&total, dx, dy);
         let mut out = Estimate::new("gaussian", &samples.labels, value, Unit::Nats, Kind::Estimate, n);
@@ -202,7 +204,7 @@ fn information(moments: &Moments, dx: usize, dy: usize) -> f64 {
     0.5 * (log_det(&alone) - log_det(&pivots[dx..]) - (bias(dx) + bias(dy) - bias(dx + dy)))
 }
 
-/// ½ \[m_x + m_y − m_xy\] per sample, m the squared Mahalanobis distances: its spread over samples and over episodes
+/// ½ \[`m_x` + `m_y` − `m_xy`\] per sample, m the squared Mahalanobis distances: its spread over samples and over episodes
 /// says how many independent samples there are. The columns have mean zero.
 fn local_information(samples: &Samples, x: &Scaled<'_>, y: &Scaled<'_>, total: &Moments) -> Vec<f64> {
     let (dx, dy, joint) = (x.columns.len(), y.columns.len(), total.covariance());
@@ -218,7 +220,7 @@ fn local_information(samples: &Samples, x: &Scaled<'_>, y: &Scaled<'_>, total: &
     samples.rows.iter().map(local).collect()
 }
 
-/// Jackknife over the parts: error² = (G − 1)/G Σ (θ_g − θ̄)².
+/// Jackknife over the parts: error² = (G − 1)/G Σ (`θ_g` − θ̄)².
 fn interval(out: &mut Estimate, total: &Moments, parts: &[Moments], dx: usize, dy: usize) {
     let g = parts.len() as f64;
     let left_out: Vec<f64> = parts

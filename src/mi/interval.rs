@@ -21,7 +21,7 @@ pub struct Interval {
 
 /// Mean and 95 % interval of `values`, whose `blocks` (equal numbers stand together) are independent of each other.
 ///
-/// Error² = B/(B−1) Σ_b (Σ_{i∈b} (v_i − v̄))² / n², with Student's t at B − 1 degrees of freedom.
+/// Error² = B/(B−1) `Σ_b` (Σ_{i∈b} (`v_i` − v̄))² / n², with Student's t at B − 1 degrees of freedom.
 pub fn block_interval(values: &[f64], blocks: &[u32]) -> Interval {
     let n = values.len() as f64;
     let mean = values.iter().sum::<f64>() / n;

@@ -1,13 +1,13 @@
 //! # What it is
 //!
-//! The Jensen–Shannon lower bound of Deep InfoMax, trained and then read on a held-out part; and, from the same critic,
+//! The Jensen–Shannon lower bound of Deep `InfoMax`, trained and then read on a held-out part; and, from the same critic,
 //! values in nats. The paper's estimator for delivered messages.
 //!
 //! # Definition
 //!
-//! With a critic T: `jsd` = E_p\[ln 2 − sp(−T)\] − E_q\[sp(T) − ln 2\], p the pairs, q the product of the margins. At its
+//! With a critic T: `jsd` = `E_p`\[ln 2 − sp(−T)\] − `E_q`\[sp(T) − ln 2\], p the pairs, q the product of the margins. At its
 //! optimum T = ln p/q, and `jsd` = 2·JSD(p‖q) ∈ \[0, 2 ln 2\]: monotone in the information, but not on its scale. In nats:
-//! `jsd-plugin` E_p\[T\], an estimate; `jsd-nwj` E_p\[T\] + 1 − E_q\[e^T\] and `jsd-dv` E_p\[T\] − ln E_q\[e^T\], lower bounds;
+//! `jsd-plugin` `E_p`\[T\], an estimate; `jsd-nwj` `E_p`\[T\] + 1 − `E_q`\[e^T\] and `jsd-dv` `E_p`\[T\] − ln `E_q`\[e^T\], lower bounds;
 //! `jsd-certified` Ξ at the lower confidence limit of JSD, a lower bound whatever the critic: Ξ = −ln s where the pair
 //! P = (1, 0), Q = (s, 1 − s) has that JSD.
 //!
@@ -17,7 +17,7 @@
 //!
 //! # Parameters
 //!
-//! None. Critic: two ReLU layers of 64 and an embedding of 32 on either side, their dot product; 16 derangements;
+//! None. Critic: two `ReLU` layers of 64 and an embedding of 32 on either side, their dot product; 16 derangements;
 //! Adam 2e-3 falling to 0, weight decay 0.5, at most 600 steps of 256 pairs, stopped on the validation episodes, by
 //! which the scores are then shifted and scaled once.
 //!
@@ -34,7 +34,7 @@
 //!
 //! # Differences from the reference implementation
 //!
-//! Deep InfoMax and its descendants report the value of the last training batch; here training, stopping and
+//! Deep `InfoMax` and its descendants report the value of the last training batch; here training, stopping and
 //! reporting have episodes of their own.
 
 use std::f64::consts::LN_2;
@@ -146,7 +146,7 @@ impl Estimator for Jsd {
         model.score(&params, &x, &y, data.test.len(), &mut seeds.stream("test score"));
         model.rescale(scale);
         let held = Held::new(&model, &data, scale);
-        let p = held.p_value(samples, &model.critic, &params, &data, protocol, seeds);
+        let p = held.p_value(samples, &model.critic, &params, &data, *protocol, seeds);
         let mut rows = held.rows(samples);
         if rows.iter().any(|r| !r.value.is_finite()) {
             return Err(diverged());
@@ -173,7 +173,7 @@ impl Estimator for Jsd {
 }
 
 /// A correction of the critic's scores, T ← slope T + offset: logistic regression on the validation part. Without it
-/// E_p\[T\] inherits the level at which training happened to stop.
+/// `E_p`\[T\] inherits the level at which training happened to stop.
 #[derive(Clone, Copy, Debug)]
 struct Scale {
     slope: f32,
@@ -220,7 +220,7 @@ impl Scale {
 /// The critic's scores on the test part, and what they average to.
 struct Held<'a> {
     positive: &'a [f32],
-    /// mean_k e^T of each sample's negatives.
+    /// `mean_k` e^T of each sample's negatives.
     exponential: Vec<f64>,
     blocks: &'a [u32],
     jsd: Interval,
@@ -264,14 +264,14 @@ impl<'a> Held<'a> {
         ]
     }
 
-    /// Whole test episodes permuted, critic kept. The product term does not change, so E_p\[−sp(−T)\] is compared.
+    /// Whole test episodes permuted, critic kept. The product term does not change, so `E_p`\[−sp(−T)\] is compared.
     fn p_value(
         &self,
         samples: &Samples,
         critic: &Separable,
         params: &[f32],
         data: &Prepared,
-        protocol: &Protocol,
+        protocol: Protocol,
         seeds: &Seeds,
     ) -> Option<f64> {
         // embeddings of every x in the test episodes, of which the permutation picks

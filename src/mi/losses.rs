@@ -18,7 +18,7 @@ fn softplus_slope(z: f32) -> (f32, f32) {
 
 /// Shifted JSD lower bound per sample and the loss −mean v, with gradients.
 ///
-/// v_i = \[ln 2 − sp(−t_i)\] − mean_k \[sp(t_ik) − ln 2\]; its mean is at most 2·JSD ≤ 2 ln 2 (subtract 2 ln 2 for the
+/// `v_i` = \[ln 2 − `sp(−t_i)`\] − `mean_k` \[`sp(t_ik)` − ln 2\]; its mean is at most 2·JSD ≤ 2 ln 2 (subtract 2 ln 2 for the
 /// value as the paper prints it). `positive` is `[n]`, `negative` `[n, k]`; writes `values` `[n]` and ∂loss/∂t.
 pub fn jsd(
     positive: &[f32],
@@ -64,7 +64,7 @@ fn negatives_per_sample(n: usize, negatives: usize) -> usize {
     negatives / n
 }
 
-/// vCLUB per sample: Σ_d −(y_i − μ_i)²/2σ_i² + mean_k Σ_d (y_k − μ_i)²/2σ_i²; returns the mean.
+/// vCLUB per sample: `Σ_d` −(`y_i` − `μ_i)²/2σ_i²` + `mean_k` `Σ_d` (`y_k` − `μ_i)²/2σ_i²`; returns the mean.
 ///
 /// `mu`, `logvar` (ln σ²) and `y` are `[n, d]`; `negatives` `[n, k]` holds rows of `y`. The ln σ² terms cancel.
 pub fn club_values(mu: &[f32], logvar: &[f32], y: &[f32], negatives: &[u32], values: &mut [f32]) -> f64 {
@@ -85,10 +85,10 @@ pub fn club_values(mu: &[f32], logvar: &[f32], y: &[f32], negatives: &[u32], val
     total / n as f64
 }
 
-/// Mean Gaussian −ln q(y|x) in nats, Σ_d ½\[(y − μ)²/σ² + ln σ² + ln 2π\], with its gradients: the loss that CLUB's q
+/// Mean Gaussian −ln q(y|x) in nats, `Σ_d` ½\[(y − μ)²/σ² + ln σ² + ln 2π\], with its gradients: the loss that CLUB's q
 /// learns by. All slices are `[n, d]`, `n` is the number of samples.
 ///
-/// The parent code minimises Σ_d \[(μ − y)²/σ² + ln σ²\]: twice this, less a constant.
+/// The parent code minimises `Σ_d` \[(μ − y)²/σ² + ln σ²\]: twice this, less a constant.
 pub fn nll(mu: &[f32], logvar: &[f32], y: &[f32], n: usize, grad_mu: &mut [f32], grad_logvar: &mut [f32]) -> f64 {
     let scale = 1.0 / n as f32;
     let mut total = 0.0;
@@ -178,9 +178,9 @@ mod tests {
             let at = |h: f32| {
                 let (mut p, mut q) = (positive.clone(), negative.clone());
                 if i < 5 {
-                    p[i] += h
+                    p[i] += h;
                 } else {
-                    q[i - 5] += h
+                    q[i - 5] += h;
                 }
                 -jsd_values(&p, &q, &mut [0.0; 5])
             };
@@ -215,9 +215,9 @@ mod tests {
             let at = |h: f32, which: usize| {
                 let (mut m, mut l) = (mu, logvar);
                 if which == 0 {
-                    m[i] += h
+                    m[i] += h;
                 } else {
-                    l[i] += h
+                    l[i] += h;
                 }
                 nll(&m, &l, &y, 2, &mut [0.0; 4], &mut [0.0; 4])
             };

@@ -27,7 +27,7 @@ pub use interval::{Interval, block_interval};
 pub use jsd::certified;
 pub use negatives::{all_others, derangements};
 pub use null::{p_value, permuted_rows};
-pub use run::{Job, JobResult, Plan, run};
+pub use run::{Job, JobResult, Named, Plan, run};
 
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;

@@ -119,5 +119,7 @@ pub(super) fn tied(samples: &Samples) -> Option<String> {
 /// Rows of a flat `[rows, width]` matrix, copied together.
 pub(super) fn gather(data: &[f32], width: usize, rows: &[u32], out: &mut Vec<f32>) {
     out.clear();
-    rows.iter().for_each(|&r| out.extend_from_slice(&data[r as usize * width..(r as usize + 1) * width]));
+    for &r in rows {
+        out.extend_from_slice(&data[r as usize * width..(r as usize + 1) * width]);
+    }
 }

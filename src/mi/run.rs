@@ -6,10 +6,13 @@ use super::{Estimate, Estimator, Kind, MiError, Protocol, Unit};
 use crate::rng::Seeds;
 use crate::schema::{SampleLabels, Samples};
 
+/// An estimator and its name.
+pub type Named = (String, Box<dyn Estimator>);
+
 /// What to run.
 pub struct Plan {
     /// Estimators with their names.
-    pub estimators: Vec<(String, Box<dyn Estimator>)>,
+    pub estimators: Vec<Named>,
     /// What all hold to.
     pub protocol: Protocol,
     /// Root of all randomness.
@@ -39,9 +42,9 @@ pub struct JobResult {
 /// The result does not depend on the number of threads: a job's randomness comes from its name.
 pub fn run(samples: &[Samples], plan: &Plan, done: &(dyn Fn() + Sync)) -> Vec<JobResult> {
     let seeds = Seeds::new(plan.seed).child("estimate-mi");
-    let jobs: Vec<(&Samples, &(String, Box<dyn Estimator>))> =
+    let jobs: Vec<(&Samples, &Named)> =
         samples.iter().flat_map(|s| plan.estimators.iter().map(move |e| (s, e))).collect();
-    let work = |&(samples, (name, estimator)): &(&Samples, &(String, Box<dyn Estimator>))| {
+    let work = |&(samples, (name, estimator)): &(&Samples, &Named)| {
         let labels = samples.labels.clone();
         let seeds = seeds.child(&format!("{}/{}/{:?}", labels.x, labels.y, labels.delivered)).child(name);
         let rows = estimator.estimate(samples, &plan.protocol, &seeds);
@@ -127,10 +130,6 @@ pub(super) mod tests {
 
     fn rows(samples: &Samples, plan: &Plan) -> Vec<Estimate> {
         run(std::slice::from_ref(samples), plan, &|| ()).into_iter().flat_map(|r| r.rows.unwrap()).collect()
-    }
-
-    fn value<'a>(rows: &'a [Estimate], name: &str) -> &'a Estimate {
-        rows.iter().find(|r| r.estimator == name).unwrap()
     }
 
     #[test]

@@ -234,7 +234,9 @@ fn numbers(frame: &DataFrame, names: &[String], path: &Path) -> Result<Columns, 
         parts.push((width, values));
     }
     for row in 0..frame.height() {
-        parts.iter().for_each(|(width, values)| out.data.extend_from_slice(&values[row * width..(row + 1) * width]));
+        for (width, values) in &parts {
+            out.data.extend_from_slice(&values[row * width..(row + 1) * width]);
+        }
     }
     Ok(out)
 }
@@ -243,14 +245,14 @@ fn numbers(frame: &DataFrame, names: &[String], path: &Path) -> Result<Columns, 
 fn flat(frame: &DataFrame, column: &Column, path: &Path) -> Result<(usize, Vec<f64>), PairsError> {
     let unfit = || not_numeric(frame, column, path);
     let plain = |column: &Column| -> Result<Vec<f64>, PairsError> {
-        let cast = column.cast(&DataType::Float64).map_err(|_| unfit())?;
-        Ok(cast.f64().map_err(|_| unfit())?.iter().map(|v| v.unwrap_or(f64::NAN)).collect())
+        let cast = column.cast(&DataType::Float64).ok().ok_or_else(unfit)?;
+        Ok(cast.f64().ok().ok_or_else(unfit)?.iter().map(|v| v.unwrap_or(f64::NAN)).collect())
     };
     let vectors: Vec<Option<Vec<f64>>> = match column.dtype() {
         kind if is_numeric(kind) => return Ok((1, plain(column)?)),
         DataType::Array(inner, _) | DataType::List(inner) if is_numeric(inner) => {
-            let list = column.cast(&DataType::List(Box::new(DataType::Float64))).map_err(|_| unfit())?;
-            let list = list.list().map_err(|_| unfit())?.clone();
+            let list = column.cast(&DataType::List(Box::new(DataType::Float64))).ok().ok_or_else(unfit)?;
+            let list = list.list().ok().ok_or_else(unfit)?.clone();
             (0..list.len())
                 .map(|i| list.get_as_series(i).map(|s| plain(&s.into())).transpose())
                 .collect::<Result<_, _>>()?
@@ -273,8 +275,8 @@ fn flat(frame: &DataFrame, column: &Column, path: &Path) -> Result<(usize, Vec<f
 /// A column as text, for grouping.
 fn texts(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<Option<String>>, PairsError> {
     let column = column(frame, name, path)?;
-    let cast = column.cast(&DataType::String).map_err(|_| not_numeric(frame, column, path))?;
-    let values = cast.str().map_err(|_| not_numeric(frame, column, path))?;
+    let cast = column.cast(&DataType::String).ok().ok_or_else(|| not_numeric(frame, column, path))?;
+    let values = cast.str().ok().ok_or_else(|| not_numeric(frame, column, path))?;
     Ok(values.iter().map(|v| v.map(str::to_owned)).collect())
 }
 

@@ -182,7 +182,9 @@ fn expand(pattern: &Path) -> Result<Vec<PathBuf>, ReportError> {
     for component in pattern.components() {
         let name = component.as_os_str().to_string_lossy();
         if !name.contains('*') {
-            paths.iter_mut().for_each(|p| p.push(component));
+            for path in &mut paths {
+                path.push(component);
+            }
             continue;
         }
         let mut next = Vec::new();

@@ -10,7 +10,7 @@ const WINDOWS: usize = 80;
 /// Learning curves of one task.
 pub(super) struct Curves {
     /// Mean over seeds with its interval, or one curve per run when a series has fewer than three seeds.
-    pub curves: Vec<Curve>,
+    pub lines: Vec<Curve>,
     /// Length of a window, environment steps.
     pub window: f64,
     /// Whether any curve is a mean over seeds.
@@ -61,7 +61,7 @@ pub(super) fn curves(runs: &[&Run]) -> Result<Option<Curves>, ReportError> {
         ends.push(format!("{series} {:.1}", mean(&group.iter().map(tail).collect::<Vec<_>>())));
     }
     let seen = format!("Mean return with exploration noise over the last tenth of training: {}.", ends.join("; "));
-    Ok(Some(Curves { curves: all, window, bands, seen }))
+    Ok(Some(Curves { lines: all, window, bands, seen }))
 }
 
 /// Mean of the logged returns in each of `count` windows.
@@ -103,12 +103,12 @@ mod tests {
         };
         let three = seeds(3);
         let result = curves(&three.iter().collect::<Vec<_>>()).unwrap().unwrap();
-        assert_eq!((result.curves.len(), result.bands, result.window), (1, true, 100.0));
-        let point = result.curves[0].points[0];
+        assert_eq!((result.lines.len(), result.bands, result.window), (1, true, 100.0));
+        let point = result.lines[0].points[0];
         assert_eq!((point.step, point.value), (50.0, 1.0));
         assert!((point.band.unwrap().1 - 1.0 - 4.302652729696142 / 3.0_f64.sqrt()).abs() < 1e-9);
         let two = seeds(2);
         let result = curves(&two.iter().collect::<Vec<_>>()).unwrap().unwrap();
-        assert_eq!((result.curves.len(), result.bands), (2, false));
+        assert_eq!((result.lines.len(), result.bands), (2, false));
     }
 }

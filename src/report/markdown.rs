@@ -75,7 +75,7 @@ pub(super) fn document(returns: &Returns) -> String {
     text.push_str(&table(&grid));
     text.push('\n');
     for note in &returns.notes {
-        text.push_str(&format!("- {}\n", escape(note)));
+        text.extend(["- ", &escape(note), "\n"]);
     }
     text
 }
@@ -84,14 +84,14 @@ pub(super) fn document(returns: &Returns) -> String {
 pub(super) fn table(grid: &Grid) -> String {
     let mut text = format!("| {} |\n", grid.header.iter().map(|h| escape(h)).collect::<Vec<_>>().join(" | "));
     let rule: Vec<&str> = (0..grid.header.len()).map(|i| if i < 2 { "---" } else { "---:" }).collect();
-    text.push_str(&format!("| {} |\n", rule.join(" | ")));
+    text.extend(["| ", &rule.join(" | "), " |\n"]);
     for line in &grid.lines {
         let cells: Vec<String> = line
             .cells
             .iter()
             .map(|(cell, bold)| if *bold { format!("**{}**", escape(cell)) } else { escape(cell) })
             .collect();
-        text.push_str(&format!("| {} |\n", cells.join(" | ")));
+        text.extend(["| ", &cells.join(" | "), " |\n"]);
     }
     text
 }

@@ -122,7 +122,8 @@ pub struct Tidy {
 /// # Errors
 /// [`ReportError::Duplicate`]: two runs of one series with one seed.
 pub(super) fn series<'a>(runs: &[&'a Run]) -> Result<Vec<(String, Vec<&'a Run>)>, ReportError> {
-    let mut groups: BTreeMap<(usize, &str, &BTreeMap<String, String>), Vec<&'a Run>> = BTreeMap::new();
+    type Settings = BTreeMap<String, String>;
+    let mut groups: BTreeMap<(usize, &str, &Settings), Vec<&'a Run>> = BTreeMap::new();
     for run in runs {
         let rank = ALGORITHMS.iter().position(|a| *a == run.algorithm).unwrap_or(ALGORITHMS.len());
         let group = groups.entry((rank, &run.algorithm, &run.settings)).or_default();

@@ -211,7 +211,7 @@ fn task_section(
         let data = Data {
             title: format!("Training on {}, {} agents", task.scenario, task.agents),
             subtitle: format!("{spread}; windows of {:.0} steps", found.window),
-            curves: found.curves,
+            curves: found.lines,
             ..base.clone()
         };
         pictures.push(output.picture("learning-curves", &data, &format!("{id}-learning-curves"), found.seen)?);

@@ -376,6 +376,8 @@ mod tests {
         let mut dumie = Dumie::new(&layout(), config, weights, &Seeds::new(1)).unwrap();
         for index in 0..60 {
             dumie.observe(&episode(index));
+        }
+        for index in 0..300 {
             dumie.train(&mut Seeds::new(2).indexed_stream("t", index), false).unwrap();
         }
         dumie.observe(&episode(1000));

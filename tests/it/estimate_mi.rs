@@ -1,5 +1,6 @@
 //! `ccmarl estimate-mi` from outside, on tables; and the fixed tables' golden rows.
 
+use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
@@ -34,7 +35,7 @@ fn csv(dir: &Path) -> String {
     let mut text = "t,a,b,g,s,c\n".to_owned();
     for i in 0..60 {
         let (a, noise) = (f64::from(i * 37 % 60), f64::from(i * i % 7));
-        text += &format!("{i},{a},{},{},w{i},1\n", a + noise, i % 12);
+        writeln!(text, "{i},{a},{},{},w{i},1", a + noise, i % 12).unwrap();
     }
     write(dir, "table.csv", &text)
 }
@@ -114,8 +115,10 @@ fn groups_series_and_rows_are_named_in_the_output() {
 #[test]
 fn missing_values_are_counted_copies_are_infinite_and_strict_fails_on_warnings() {
     let dir = tempfile::tempdir().unwrap();
-    let mut text = "a,b,d\n,1,1\n2,NaN,2\n".to_owned();
-    (0..40).for_each(|i| text += &format!("{i}.5,{},{}\n", i * i % 11, 2 * i));
+    let mut text = "a,b,d\n,1,1\n2,NaN,3\n".to_owned();
+    for i in 0..40 {
+        writeln!(text, "{i}.5,{},{}", i * i % 11, 2 * i).unwrap();
+    }
     let table = write(dir.path(), "gaps.csv", &text);
     let rows = json(&[&table, "--x", "a", "--y", "b", "--estimator", "gaussian"]);
     assert_eq!(

@@ -1,4 +1,5 @@
 //! Reports: the committed fixture, hostile and broken input, seeds and intervals.
+#![expect(clippy::unwrap_used, clippy::panic, reason = "helpers of tests fail like tests")]
 
 use std::path::{Path, PathBuf};
 
@@ -16,7 +17,7 @@ fn parquet(path: &Path, columns: Vec<Column>) {
 }
 
 /// The columns of `frame` with one exchanged.
-fn with(frame: &DataFrame, new: Column) -> Vec<Column> {
+fn with(frame: &DataFrame, new: &Column) -> Vec<Column> {
     frame.columns().iter().map(|c| if c.name() == new.name() { new.clone() } else { c.clone() }).collect()
 }
 
@@ -82,8 +83,9 @@ fn report(inputs: &[PathBuf], mi: &[PathBuf], out: &Path) -> Result<Summary, Err
     Ok(write(&collected, &request)?)
 }
 
-fn read(path: PathBuf) -> String {
-    std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{e}: {} (made by: {REGENERATE})", path.display()))
+fn read(path: impl AsRef<Path>) -> String {
+    let path = path.as_ref();
+    std::fs::read_to_string(path).unwrap_or_else(|e| panic!("{e}: {} (made by: {REGENERATE})", path.display()))
 }
 
 const MADE: [&str; 4] = [
@@ -138,7 +140,7 @@ fn changing_one_return_changes_figure_and_table() {
     let frame = ParquetReader::new(std::fs::File::open(&path).unwrap()).finish().unwrap();
     let mut returns: Vec<f64> = frame.column("return").unwrap().f64().unwrap().iter().flatten().collect();
     returns[4 * 5 + 2] += 10.0; // dbc-medium, episode 2
-    parquet(&path, with(&frame, Column::new("return".into(), returns)));
+    parquet(&path, with(&frame, &Column::new("return".into(), returns)));
     report(&[runs], &[], &dir.path().join("r")).unwrap();
     let same = |name: &str| {
         let file = Path::new(name).file_name().unwrap();
@@ -205,7 +207,7 @@ fn broken_tables_name_column_and_file() {
     let good = ParquetReader::new(std::fs::File::open(&path).unwrap()).finish().unwrap();
     let error = |columns: Vec<Column>| {
         parquet(&path, columns);
-        let text = report(&[run.clone()], &[], &dir.path().join("r")).unwrap_err().to_string();
+        let text = report(std::slice::from_ref(&run), &[], &dir.path().join("r")).unwrap_err().to_string();
         assert!(text.ends_with(&format!(": {}", path.display())), "{text}");
         assert!(!dir.path().join("r").exists() && !dir.path().join(".r.partial").exists());
         text.replace(&format!(": {}", path.display()), "")
@@ -217,19 +219,19 @@ fn broken_tables_name_column_and_file() {
     );
     let n = good.height();
     let text = Column::new("return".into(), vec!["much"; n]);
-    assert_eq!(error(with(&good, text)), "column \"return\": expected numbers, found str");
+    assert_eq!(error(with(&good, &text)), "column \"return\": expected numbers, found str");
     let nan = Column::new("return".into(), vec![f64::NAN; n]);
-    assert_eq!(error(with(&good, nan)), "column \"return\", row 0: expected a finite number, found NaN");
+    assert_eq!(error(with(&good, &nan)), "column \"return\", row 0: expected a finite number, found NaN");
     assert_eq!(error(good.head(Some(0)).columns().to_vec()), "expected at least one row, found none");
-    parquet(&path, with(&good, Column::new("algorithm".into(), vec!["maddpg"; n])));
-    let mismatch = report(&[run.clone()], &[], &dir.path().join("r")).unwrap_err().to_string();
+    parquet(&path, with(&good, &Column::new("algorithm".into(), vec!["maddpg"; n])));
+    let mismatch = report(std::slice::from_ref(&run), &[], &dir.path().join("r")).unwrap_err().to_string();
     assert!(mismatch.starts_with("algorithm: config.toml says \"fc-maddpg\", evaluation.parquet says \"maddpg\""));
 
     parquet(&path, good.columns().to_vec());
     let bytes = std::fs::read(&path).unwrap();
     for length in [0, 3, bytes.len() / 2, bytes.len() - 1] {
         ccmarl::io::write_atomic(&path, &bytes[..length]).unwrap();
-        let text = report(&[run.clone()], &[], &dir.path().join("r")).unwrap_err().to_string();
+        let text = report(std::slice::from_ref(&run), &[], &dir.path().join("r")).unwrap_err().to_string();
         assert!(text.starts_with("expected a Parquet file, found one that cannot be read"), "{length}: {text}");
     }
 }
