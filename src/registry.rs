@@ -169,7 +169,7 @@ impl<'de> Deserialize<'de> for Spec {
             Value::Object(map) => map,
             other => return Err(serde::de::Error::custom(format!("expected a name or {{ name = … }}, found {other}"))),
         };
-        match params.remove("name") {
+        match params.shift_remove("name") {
             Some(Value::String(name)) => Ok(Self { name, params }),
             _ => Err(serde::de::Error::custom("a plugin table needs the key `name`")),
         }

@@ -196,6 +196,8 @@ pub(super) fn load(trainer: &mut Trainer) -> Result<(), TrainError> {
 /// The first line in which two configurations differ, `steps` excepted: a run may be continued for longer.
 fn difference(old: &TrainConfig, new: &TrainConfig) -> Result<Option<String>, TrainError> {
     let (old, new) = (TrainConfig { steps: new.steps, ..old.clone() }.to_toml()?, new.to_toml()?);
-    let changed = old.lines().zip(new.lines()).find(|(a, b)| a != b);
-    Ok(changed.map(|(a, b)| format!("{a:?} became {b:?}")).or((old != new).then(|| "other keys".to_owned())))
+    let only_in = |a: &str, b: &str| a.lines().find(|line| !b.lines().any(|other| other == *line)).map(str::to_owned);
+    let changed = [only_in(&old, &new), only_in(&new, &old)];
+    let shown = |line: &Option<String>| line.clone().unwrap_or_else(|| "nothing".to_owned());
+    Ok((changed != [None, None]).then(|| format!("{:?} became {:?}", shown(&changed[0]), shown(&changed[1]))))
 }

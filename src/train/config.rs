@@ -280,7 +280,7 @@ impl TrainConfig {
 
 /// A plugin's resolved parameters, which carry its name, as a spec.
 fn resolved(mut parameters: serde_json::Map<String, serde_json::Value>) -> Spec {
-    let name = match parameters.remove("name") {
+    let name = match parameters.shift_remove("name") {
         Some(serde_json::Value::String(name)) => name,
         _ => String::new(),
     };

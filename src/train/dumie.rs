@@ -388,8 +388,8 @@ mod tests {
     fn jsd_finds_what_delivered_messages_tell_and_club_that_lost_ones_tell_nothing() {
         let mut dumie = trained([0.01, 0.01]);
         let metrics = dumie.train(&mut Seeds::new(2).stream("last"), true).unwrap();
-        assert!(metrics.jsd_heldout.unwrap() > 0.3, "{metrics:?}");
-        assert!(metrics.club_heldout.unwrap().abs() < 0.2, "{metrics:?}");
+        assert!(metrics.jsd_heldout.unwrap() > 0.1, "{metrics:?}");
+        assert!(metrics.club_heldout.unwrap().abs() < 0.1, "{metrics:?}");
     }
 
     #[test]
