@@ -48,10 +48,14 @@ impl Error {
         let exists = |e: &IoError| matches!(e, IoError::Exists(_));
         match self {
             Self::Pairs(error) => error.is_usage(),
-            Self::Registry(_) | Self::Record(RecordError::NoEpisodes) | Self::Report(ReportError::NoInput) => true,
-            Self::Train(TrainError::Registry(_) | TrainError::Config { .. } | TrainError::Value { .. }) => true,
-            Self::Io(e) | Self::Report(ReportError::Io(e)) => exists(e),
-            Self::Storage(StorageError::Io(e)) | Self::Train(TrainError::Io(e)) => exists(e),
+            Self::Registry(_)
+            | Self::Record(RecordError::NoEpisodes)
+            | Self::Report(ReportError::NoInput)
+            | Self::Train(TrainError::Registry(_) | TrainError::Config { .. } | TrainError::Value { .. }) => true,
+            Self::Io(e)
+            | Self::Report(ReportError::Io(e))
+            | Self::Storage(StorageError::Io(e))
+            | Self::Train(TrainError::Io(e) | TrainError::Storage(StorageError::Io(e))) => exists(e),
             _ => false,
         }
     }

@@ -1,6 +1,6 @@
 //! The seed tree: every generator of the program is a named child of one seed.
 //!
-//! `Seeds::new(1).child("record").child("episode/17").stream("agent/2")` is the same ChaCha8 stream on every
+//! `Seeds::new(1).child("record").child("episode/17").stream("agent/2")` is the same `ChaCha8` stream on every
 //! machine, whatever thread asks and in whatever order. There is no other way to make a generator.
 
 use rand::{Rng, RngExt as _, SeedableRng as _};

@@ -74,7 +74,7 @@ pub struct Actors {
 }
 
 impl Actors {
-    /// Actors with two hidden ReLU layers and tanh outputs for these learners.
+    /// Actors with two hidden `ReLU` layers and tanh outputs for these learners.
     pub fn new(learners: &[&AgentSpec], hidden: &[usize], messages: bool) -> Self {
         let observation: Vec<usize> = learners.iter().map(|a| a.observation).collect();
         let all: usize = observation.iter().sum();

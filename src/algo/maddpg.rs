@@ -9,7 +9,7 @@
 //! 4. targets: θ⁻ ← (1 − τ) θ⁻ + τ θ.
 //!
 //! Source: Lowe et al. 2017; the joint step and the constants are those of the paper's parent code (one critic, one
-//! actor loss). Link bits are those drawn at rollout, ι_t for o and ι_{t+1} for o'.
+//! actor loss). Link bits are those drawn at rollout, `ι_t` for o and ι_{t+1} for o'.
 
 use serde::{Deserialize, Serialize};
 

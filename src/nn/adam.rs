@@ -1,4 +1,4 @@
-//! Adam (Kingma & Ba 2015, PyTorch's defaults), gradient clipping and the soft target update.
+//! Adam (Kingma & Ba 2015, `PyTorch`'s defaults), gradient clipping and the soft target update.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,7 +16,7 @@ pub struct AdamConfig {
 }
 
 impl AdamConfig {
-    /// PyTorch's defaults at this learning rate.
+    /// `PyTorch`'s defaults at this learning rate.
     pub fn new(learning_rate: f32) -> Self {
         Self { learning_rate, beta1: 0.9, beta2: 0.999, epsilon: 1e-8 }
     }
@@ -62,7 +62,9 @@ pub fn clip_norm(grads: &mut [f32], limit: f32) -> f32 {
     let norm = grads.iter().map(|&g| f64::from(g) * f64::from(g)).sum::<f64>().sqrt() as f32;
     if norm > limit {
         let scale = limit / (norm + 1e-6);
-        grads.iter_mut().for_each(|g| *g *= scale);
+        for g in grads.iter_mut() {
+            *g *= scale;
+        }
     }
     norm
 }

@@ -1,7 +1,7 @@
 //! A multilayer perceptron: its shape, its forward pass and its backward pass.
 //!
 //! Parameters live outside, in one flat slice: per layer the weight `[outputs, inputs]` then the bias `[outputs]`
-//! (PyTorch's layout). Rows go through all layers tile by tile, so that a tile stays in cache.
+//! (`PyTorch`'s layout). Rows go through all layers tile by tile, so that a tile stays in cache.
 
 use rand::Rng;
 
@@ -87,6 +87,9 @@ fn grow(buffer: &mut Vec<f32>, len: usize) -> &mut [f32] {
 
 impl Mlp {
     /// A perceptron of these widths: inputs, hidden layers, outputs.
+    ///
+    /// # Panics
+    /// When there are fewer than two widths, or one is 0.
     pub fn new(widths: &[usize], hidden: Activation, output: Activation) -> Self {
         assert!(widths.len() >= 2 && widths.iter().all(|&w| w > 0), "a perceptron needs positive widths");
         Self { widths: widths.to_vec(), hidden, output }
@@ -122,7 +125,7 @@ impl Mlp {
         if layer + 1 == self.layers() { self.output } else { self.hidden }
     }
 
-    /// Appends fresh parameters: U(−1/√inputs, 1/√inputs) for weights and biases, PyTorch's default for `Linear`.
+    /// Appends fresh parameters: U(−1/√inputs, 1/√inputs) for weights and biases, `PyTorch`'s default for `Linear`.
     pub fn init<R: Rng + ?Sized>(&self, rng: &mut R, out: &mut Vec<f32>) {
         for layer in 0..self.layers() {
             let ([outputs, inputs], _) = self.weight(layer);
@@ -132,6 +135,9 @@ impl Mlp {
     }
 
     /// Forward pass of `[rows, inputs]`; the output stays in the tape.
+    ///
+    /// # Panics
+    /// When a slice is shorter than its shape.
     pub fn forward<'t>(&self, params: &[f32], input: &[f32], rows: usize, tape: &'t mut Tape) -> &'t [f32] {
         assert!(params.len() >= self.parameters() && input.len() >= rows * self.inputs());
         tape.rows = rows;
@@ -186,6 +192,9 @@ impl Mlp {
     /// Backward pass of the forward pass in `tape`: adds ∂L/∂params to `grads` and writes ∂L/∂input to `grad_input`.
     ///
     /// `grad_output` is ∂L/∂output, `[rows, outputs]`; `grads` has one element per parameter (empty: not wanted).
+    ///
+    /// # Panics
+    /// When a slice does not have its shape.
     pub fn backward(
         &self,
         params: &[f32],

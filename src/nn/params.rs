@@ -94,7 +94,7 @@ impl Params {
     }
 }
 
-/// Adds `mlp`'s tensors to `out` under PyTorch's names: `<prefix>.<layer>.weight` `[outputs, inputs]`, `….bias`.
+/// Adds `mlp`'s tensors to `out` under `PyTorch`'s names: `<prefix>.<layer>.weight` `[outputs, inputs]`, `….bias`.
 ///
 /// # Errors
 /// [`NnError::Candle`].

@@ -163,9 +163,8 @@ impl PolicyEpisode for Acting<'_> {
             actions[from..to].copy_from_slice(action);
             for action in &mut actions[from..to] {
                 let noise = match self.team.noise {
-                    ActionNoise::None => continue,
                     ActionNoise::Gaussian(sigma) => sigma * rng::normal(&mut self.noise),
-                    ActionNoise::OrnsteinUhlenbeck { scale, .. } if scale == 0.0 => continue,
+                    ActionNoise::None | ActionNoise::OrnsteinUhlenbeck { scale: 0.0, .. } => continue,
                     ActionNoise::OrnsteinUhlenbeck { theta, sigma, scale } => {
                         let x = &mut self.process[component];
                         *x += sigma * rng::normal(&mut self.noise) - theta * *x;

@@ -1,6 +1,6 @@
 //! Checkpoints: everything that decides how a run goes on, as safetensors.
 //!
-//! `checkpoint/actors.safetensors` is for users (PyTorch's names and shapes); `checkpoint/state.safetensors` holds the
+//! `checkpoint/actors.safetensors` is for users (`PyTorch`'s names and shapes); `checkpoint/state.safetensors` holds the
 //! networks, targets, optimisers, replay, rings and counters. Generators need no state: every stream is named by the
 //! index of its episode or update.
 

@@ -1,6 +1,6 @@
 //! Du-MIE: two mutual-information estimators that shape the team reward (paper Eqs. 3–6).
 //!
-//! r̃ = r + Σ_i Σ_{j≠i} [ α ι^{ji} I_JSD(m^{ji}; a^i) − β (1 − ι^{ji}) I_CLUB(m^{ji}; a^i) ]
+//! r̃ = r + `Σ_i` Σ_{j≠i} [ α ι^{ji} `I_JSD(m^{ji`}; a^i) − β (1 − ι^{ji}) `I_CLUB(m^{ji`}; a^i) ]
 //!
 //! JSD (lower bound) learns from a ring of delivered pairs, CLUB (upper bound) from a ring of lost ones; both are
 //! shared over all ordered links. Values are per sample; negatives are cyclic shifts of the action at fixed message,
@@ -236,9 +236,9 @@ impl Dumie {
             if delivered { self.displayed(mean) } else { mean }
         });
         if delivered {
-            self.jsd.fresh = pairs
+            self.jsd.fresh = pairs;
         } else {
-            self.club.fresh = pairs
+            self.club.fresh = pairs;
         }
         value
     }

@@ -1,4 +1,4 @@
-//! What a run reports while it learns: one row per logging interval, as Parquet and as TensorBoard events.
+//! What a run reports while it learns: one row per logging interval, as Parquet and as `TensorBoard` events.
 
 use std::path::Path;
 
@@ -69,7 +69,7 @@ pub(super) fn write_parquet(path: &Path, columns: Vec<Column>) -> Result<(), Tra
     Ok(crate::io::write_atomic(path, &bytes)?)
 }
 
-/// Writes `metrics.parquet` and the TensorBoard events of a run.
+/// Writes `metrics.parquet` and the `TensorBoard` events of a run.
 pub(super) fn write(dir: &Path, rows: &[MetricsRow]) -> Result<(), TrainError> {
     let whole = |name: &str, value: fn(&MetricsRow) -> u64| {
         Column::new(name.into(), rows.iter().map(|r| value(r) as i64).collect::<Vec<_>>())

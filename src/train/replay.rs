@@ -118,9 +118,9 @@ impl Replay {
         let range = slot * self.steps..(slot + 1) * self.steps;
         self.reward[range.clone()].copy_from_slice(&episode.reward);
         if bonus.is_empty() {
-            self.bonus[range].fill(0.0)
+            self.bonus[range].fill(0.0);
         } else {
-            self.bonus[range].copy_from_slice(bonus)
+            self.bonus[range].copy_from_slice(bonus);
         }
         self.pushed += 1;
         Ok(())

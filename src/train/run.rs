@@ -295,7 +295,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// Writes checkpoint, metrics and TensorBoard events.
+    /// Writes checkpoint, metrics and `TensorBoard` events.
     ///
     /// # Errors
     /// [`TrainError`].
@@ -317,7 +317,7 @@ impl Trainer {
     }
 }
 
-/// Trains as `config` says into the run directory `dir`, which gets `config.toml`, `metrics.parquet`, TensorBoard
+/// Trains as `config` says into the run directory `dir`, which gets `config.toml`, `metrics.parquet`, `TensorBoard`
 /// events and `checkpoint/`. When `stop` turns true the run is saved after the episode at hand and ends.
 ///
 /// # Errors
@@ -349,6 +349,9 @@ pub fn train(
         trainer.advance(sink.as_deref_mut())?;
         if trainer.update - saved >= CHECKPOINT_EVERY {
             trainer.save()?;
+            if let Some(sink) = &mut sink {
+                sink.commit()?;
+            }
             saved = trainer.update;
         }
         progress(Progress { step: trainer.step, return_mean: trainer.return_mean() });

@@ -1,4 +1,4 @@
-//! TensorBoard event files: scalar summaries as length-delimited protobuf with masked CRC-32C.
+//! `TensorBoard` event files: scalar summaries as length-delimited protobuf with masked CRC-32C.
 
 use prost::Message as _;
 
@@ -28,7 +28,7 @@ struct Scalar {
     simple_value: f32,
 }
 
-/// TFRecord's checksum: CRC-32C, rotated and offset.
+/// `TFRecord`'s checksum: CRC-32C, rotated and offset.
 fn masked_crc(bytes: &[u8]) -> [u8; 4] {
     crc32c::crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8).to_le_bytes()
 }

@@ -1,5 +1,5 @@
 //! Benchmarks of the core: stepping worlds, rolling out episodes, one update of the learner.
-#![expect(missing_docs, reason = "criterion's macros make undocumented items")]
+#![expect(clippy::unwrap_used, reason = "a benchmark that cannot start may panic")]
 
 use std::hint::black_box;
 use std::path::Path;

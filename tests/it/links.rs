@@ -1,5 +1,4 @@
 //! Links: contract over the registry, realised loss of recorded episodes.
-#![expect(clippy::unwrap_used, reason = "helpers of tests")]
 
 use ccmarl::link::{LINKS, Link, Setting, build};
 use ccmarl::record::{Recording, build_policy, returns};

@@ -1,5 +1,4 @@
 //! Recording: contract over the policies, determinism, the command's refusals.
-#![expect(clippy::unwrap_used, reason = "helpers of tests")]
 
 use std::io::{BufRead as _, BufReader};
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,5 +1,4 @@
 //! Reports: the committed fixture, hostile and broken input, seeds and intervals.
-#![expect(clippy::unwrap_used, clippy::panic, reason = "helpers of tests fail like tests")]
 
 use std::path::{Path, PathBuf};
 

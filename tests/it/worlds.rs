@@ -1,5 +1,4 @@
 //! Scenarios: contract over the registry, symmetries, reference returns.
-#![expect(clippy::unwrap_used, reason = "helpers of tests")]
 
 use ccmarl::link::{Setting, build as build_link};
 use ccmarl::record::{EpisodeReturn, Recording, build_policy, returns};
