@@ -16,6 +16,9 @@ pub enum Error {
     /// Files and directories.
     #[error(transparent)]
     Io(#[from] IoError),
+    /// Arguments that do not go together, or that nothing can be done with.
+    #[error("{0}")]
+    Usage(String),
     /// A plugin's name or parameters.
     #[error(transparent)]
     Registry(#[from] RegistryError),
@@ -51,7 +54,7 @@ impl Error {
             Self::Registry(_)
             | Self::Record(RecordError::NoEpisodes)
             | Self::Report(ReportError::NoInput)
-            | Self::Train(TrainError::Registry(_) | TrainError::Config { .. } | TrainError::Value { .. }) => true,
+            | Self::Train(TrainError::Config { .. } | TrainError::Value { .. }) => true,
             Self::Io(e)
             | Self::Report(ReportError::Io(e))
             | Self::Storage(StorageError::Io(e))

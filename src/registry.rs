@@ -53,6 +53,9 @@ pub enum RegistryError {
         /// What is wrong, and the allowed range.
         message: String,
     },
+    /// A file that a parameter names cannot be used.
+    #[error("{0}")]
+    Data(String),
 }
 
 /// A plugin as a user names it: its name and its parameters. Serialises as one flat table `{name, …}`.

@@ -32,8 +32,9 @@ pub struct MaddpgConfig {
     pub gamma: f32,
     /// Share of the online network that enters the target per update.
     pub tau: f32,
-    /// Transitions per update, drawn with replacement.
-    pub batch: usize,
+    /// Transitions per update, drawn with replacement; 1024, or 512 on `simple_tag` with six learners or more.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub batch: Option<usize>,
     /// Largest L2 norm of the critic's gradient, and of each actor's.
     pub grad_clip: f32,
     /// Weight of mean a² in the actors' loss.
@@ -52,6 +53,11 @@ pub enum Messages {
     Off,
 }
 
+impl MaddpgConfig {
+    /// The paper's batch, where nothing else is said.
+    pub const BATCH: usize = 1024;
+}
+
 impl Default for MaddpgConfig {
     fn default() -> Self {
         Self {
@@ -60,7 +66,7 @@ impl Default for MaddpgConfig {
             critic_learning_rate: 1e-3,
             gamma: 0.95,
             tau: 0.01,
-            batch: 1024,
+            batch: None,
             grad_clip: 0.5,
             action_penalty: 1e-6,
             messages: Messages::Observation,
@@ -79,7 +85,7 @@ pub struct Batch {
     pub next_observations: Vec<f32>,
     /// `[B, A]`.
     pub actions: Vec<f32>,
-    /// `[B, N, N]`, [sender][receiver].
+    /// `[B, N, N]`, sender by receiver.
     pub link: Vec<bool>,
     /// `[B, N, N]`.
     pub next_link: Vec<bool>,

@@ -126,9 +126,10 @@ fn writer(path: &Path, force: bool) -> anyhow::Result<Write> {
     let forms: [(&str, Write); 3] = [("json", mi::to_json), ("csv", mi::to_csv), ("parquet", mi::to_parquet)];
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
     let form = forms.iter().find(|(name, _)| extension.as_deref() == Some(*name));
-    form.map(|(_, write)| *write).with_context(|| {
-        format!("--out: expected a name that ends in .json, .csv or .parquet, found {}", path.display())
-    })
+    let usage = || {
+        Error::Usage(format!("--out: expected a name that ends in .json, .csv or .parquet, found {}", path.display()))
+    };
+    Ok(form.map(|(_, write)| *write).ok_or_else(usage)?)
 }
 
 fn samples(args: &Args) -> Result<Vec<Samples>, Error> {

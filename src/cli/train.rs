@@ -52,7 +52,7 @@ pub(super) struct Args {
     #[arg(long)]
     out: PathBuf,
     /// Store whose episodes fill replay and rings before the first step
-    #[arg(long, value_name = "STORE")]
+    #[arg(long, value_name = "STORE", conflicts_with = "resume")]
     warm_start: Option<PathBuf>,
     /// Store that takes the run's own rollouts
     #[arg(long, value_name = "STORE", conflicts_with = "resume")]

@@ -1,6 +1,6 @@
 //! Samples from stores and tables.
 //!
-//! [`links`] reads a store: one set of samples per ordered link and class, delivered and lost apart. [`table`] reads
+//! [`links`] reads a store: one set of samples per ordered link and class, delivered and lost apart. [`table()`] reads
 //! anybody's CSV or Parquet file: one set from named columns.
 
 mod store;

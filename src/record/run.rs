@@ -29,7 +29,7 @@ use super::{Build, Policy, PolicyEpisode, View};
 use crate::algo::Actors;
 use crate::io::IoError;
 use crate::nn::Tape;
-use crate::registry::Entry;
+use crate::registry::{Entry, RegistryError};
 use crate::rng::{self, Seeds, Stream};
 use crate::scenario::{Scenario, offsets};
 use crate::schema::AgentSpec;
@@ -52,11 +52,12 @@ pub(super) const ENTRY: Entry<Build> = Entry {
         if !(0.0..=10.0).contains(&params.action_noise) {
             return Err(spec.invalid(format!("action_noise: expected 0 to 10, found {}", params.action_noise)));
         }
-        let (actors, values) = Actors::load(&params.path).map_err(|e| spec.invalid(e.to_string()))?;
-        actors.check_fit(&learners(scenario), &params.path).map_err(|e| spec.invalid(e.to_string()))?;
+        let (actors, values) = Actors::load(&params.path).map_err(|e| RegistryError::Data(e.to_string()))?;
+        actors.check_fit(&learners(scenario), &params.path).map_err(|e| RegistryError::Data(e.to_string()))?;
         let noise =
             if params.action_noise > 0.0 { ActionNoise::Gaussian(params.action_noise) } else { ActionNoise::None };
-        let parameters = described(&params.path, params.action_noise).map_err(|e| spec.invalid(e.to_string()))?;
+        let parameters =
+            described(&params.path, params.action_noise).map_err(|e| RegistryError::Data(e.to_string()))?;
         Ok(Box::new(Trained { actors, params: values, noise, parameters }))
     },
 };

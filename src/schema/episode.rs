@@ -45,7 +45,7 @@ pub struct Episode {
     pub observations: Vec<Matrix>,
     /// Per agent, what it sent, before the channel, `[(T+1), message]`; width 0 for who does not send.
     pub messages: Vec<Matrix>,
-    /// Link bits `[(T+1), N, N]`, [sender][receiver] over the communicators, diagonal true.
+    /// Link bits `[(T+1), N, N]`, sender by receiver over the communicators, diagonal true.
     pub link: Vec<bool>,
     /// Per agent `[T, action]`; width 0 for who does not act.
     pub actions: Vec<Matrix>,

@@ -69,6 +69,9 @@ pub(super) fn save(trainer: &Trainer) -> Result<(), TrainError> {
             put_adam(&mut tensors, &format!("{name}_adam"), &estimator.adam)?;
             put(&mut tensors, &format!("{name}_ring.messages"), &estimator.ring.messages)?;
             put(&mut tensors, &format!("{name}_ring.actions"), &estimator.ring.actions)?;
+            let [messages, actions] = estimator.fresh();
+            put(&mut tensors, &format!("{name}_fresh.messages"), messages)?;
+            put(&mut tensors, &format!("{name}_fresh.actions"), actions)?;
             adam[2 + at] = estimator.adam.t;
             ring_pushed[at] = estimator.ring.pushed;
         }
@@ -170,6 +173,10 @@ pub(super) fn load(trainer: &mut Trainer) -> Result<(), TrainError> {
                 return Err(fail(format!("{name}_ring: its length does not fit its counter")));
             }
             estimator.ring = ring;
+            let fresh = |part: &str| floats(&format!("{name}_fresh.{part}"));
+            if !estimator.restore_fresh(fresh("messages")?, fresh("actions")?) {
+                return Err(fail(format!("{name}_fresh: its lengths do not fit")));
+            }
         }
     }
     let means = doubles("means")?;

@@ -209,6 +209,8 @@ impl TrainConfig {
         self.prior = Some(resolved(crate::link::build(&prior, &setting)?.parameters()));
         let tag = self.scenario.name == "simple_tag";
         let [alpha, beta] = if preset.shaped { [0.01, if tag { 0.001 } else { 0.01 }] } else { [0.0, 0.0] };
+        let learners = crate::scenario::build(&self.scenario)?.agents().iter().filter(|a| a.learner).count();
+        self.maddpg.batch.get_or_insert(if tag && learners >= 6 { 512 } else { MaddpgConfig::BATCH });
         self.dumie.alpha.get_or_insert(alpha);
         self.dumie.beta.get_or_insert(beta);
         self.check()?;
@@ -239,7 +241,7 @@ impl TrainConfig {
             positive("replay", self.replay),
             positive("update_every", self.update_every as usize),
             positive("log_every", self.log_every as usize),
-            positive("maddpg.batch", m.batch),
+            positive("maddpg.batch", m.batch.unwrap_or(0)),
             positive("maddpg.hidden", m.hidden.iter().copied().min().unwrap_or(0)),
             unit("maddpg.gamma", m.gamma),
             unit("maddpg.tau", m.tau),

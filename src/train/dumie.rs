@@ -68,8 +68,24 @@ pub struct Estimator {
     pub adam: Adam,
     /// The newest pairs of its class.
     pub ring: Ring,
-    /// Pairs that came since the last update: held out until then.
+    /// Pairs that came since the last update, at most a ring's worth: held out until then.
     fresh: Pairs,
+}
+
+impl Estimator {
+    /// The pairs held out until the next update: messages and actions, flat.
+    pub(super) fn fresh(&self) -> [&[f32]; 2] {
+        [&self.fresh.messages, &self.fresh.actions]
+    }
+
+    /// Takes over held-out pairs of a checkpoint; false when their lengths do not fit.
+    pub(super) fn restore_fresh(&mut self, messages: Vec<f32>, actions: Vec<f32>) -> bool {
+        let [m, a] = self.ring.widths;
+        let pairs = messages.len() / m;
+        let fits = messages.len() == pairs * m && actions.len() == pairs * a;
+        self.fresh = Pairs { messages, actions, rows: vec![0; pairs] };
+        fits
+    }
 }
 
 /// The dual estimator.
@@ -152,20 +168,22 @@ impl Dumie {
                     let message = if zero { &[][..] } else { episode.messages[sender].row(row) };
                     let action = episode.actions[receiver].row(row);
                     estimator.ring.push(message, action);
-                    estimator.fresh.push(self.widths, message, action, row);
+                    if estimator.fresh.len() < self.config.ring {
+                        estimator.fresh.push(self.widths, message, action, row);
+                    }
                 }
             }
         }
     }
 
-    /// k steps of each estimator whose ring is full enough, and what they report; held-out values come first, from
-    /// the pairs observed since the last call.
+    /// k steps of each estimator whose ring is full enough, and what they report. With a stream for them, held-out
+    /// values come first, from the pairs observed since the last call; they change nothing else.
     ///
     /// # Errors
     /// [`TrainError::Nn`].
-    pub fn train(&mut self, rng: &mut Stream, report: bool) -> Result<DumieMetrics, TrainError> {
+    pub fn train(&mut self, rng: &mut Stream, heldout: Option<&mut Stream>) -> Result<DumieMetrics, TrainError> {
         let mut metrics = DumieMetrics::default();
-        if report {
+        if let Some(rng) = heldout {
             metrics.jsd_heldout = self.heldout(true, rng);
             metrics.club_heldout = self.heldout(false, rng);
         }
@@ -294,7 +312,8 @@ impl Dumie {
         for (class, pairs) in classes.iter().enumerate() {
             let delivered = class == 0;
             let weight = if delivered { self.weights[0] } else { -self.weights[1] } as f32;
-            let learned = if delivered { &self.jsd } else { &self.club }.ring.len() >= self.config.start;
+            let estimator = if delivered { &self.jsd } else { &self.club };
+            let learned = estimator.ring.len() >= self.config.start && estimator.adam.t > 0;
             if weight == 0.0 || !learned || pairs.len() < 2 {
                 continue;
             }
@@ -378,7 +397,7 @@ mod tests {
             dumie.observe(&episode(index));
         }
         for index in 0..300 {
-            dumie.train(&mut Seeds::new(2).indexed_stream("t", index), false).unwrap();
+            dumie.train(&mut Seeds::new(2).indexed_stream("t", index), None).unwrap();
         }
         dumie.observe(&episode(1000));
         dumie
@@ -387,7 +406,7 @@ mod tests {
     #[test]
     fn jsd_finds_what_delivered_messages_tell_and_club_that_lost_ones_tell_nothing() {
         let mut dumie = trained([0.01, 0.01]);
-        let metrics = dumie.train(&mut Seeds::new(2).stream("last"), true).unwrap();
+        let metrics = dumie.train(&mut Seeds::new(2).stream("last"), Some(&mut Seeds::new(2).stream("held"))).unwrap();
         assert!(metrics.jsd_heldout.unwrap() > 0.1, "{metrics:?}");
         assert!(metrics.club_heldout.unwrap().abs() < 0.1, "{metrics:?}");
     }

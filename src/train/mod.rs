@@ -57,7 +57,7 @@ pub enum TrainError {
     #[error("cannot train on this: {0}")]
     Store(String),
     /// Numbers stopped being numbers.
-    #[error("the run diverged at step {step}: {what} is no longer finite; lower the learning rates (the last good checkpoint was kept): {}", path.display())]
+    #[error("the run diverged at step {step}: {what} is no longer finite; lower the learning rates; the last good checkpoint is kept: {}", path.display())]
     Diverged {
         /// Environment step.
         step: u64,

@@ -6,9 +6,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use super::config::{Shaping, TrainConfig};
 use super::dumie::Dumie;
 use super::metrics::{self, Means, MetricsRow};
-use super::replay::Replay;
+use super::replay::{Replay, Ring};
 use super::{TrainError, checkpoint};
-use crate::algo::{Batch, Maddpg};
+use crate::algo::{Batch, Maddpg, MaddpgConfig};
 use crate::link::{self, Link, Setting};
 use crate::record::{ActionNoise, Recording, Trained, loss_rate};
 use crate::rng::Seeds;
@@ -212,7 +212,8 @@ impl Trainer {
     /// Draws the minibatch of update number `update`.
     fn draw(&mut self, update: u64) -> crate::rng::Stream {
         let mut rng = self.seeds.indexed_stream("update", update);
-        self.replay.sample(&mut rng, self.config.maddpg.batch, &mut self.batch);
+        let rows = self.config.maddpg.batch.unwrap_or(MaddpgConfig::BATCH);
+        self.replay.sample(&mut rng, rows, &mut self.batch);
         rng
     }
 
@@ -234,7 +235,8 @@ impl Trainer {
         let report = (self.update + 1).is_multiple_of(self.config.log_every);
         self.bonus.clear();
         if let Some(dumie) = &mut self.dumie {
-            let found = dumie.train(&mut rng, report)?;
+            let mut heldout = report.then(|| self.seeds.indexed_stream("heldout", self.update));
+            let found = dumie.train(&mut rng, heldout.as_mut())?;
             for (name, value) in [
                 ("jsd", found.jsd),
                 ("jsd_heldout", found.jsd_heldout),
@@ -300,6 +302,13 @@ impl Trainer {
     /// # Errors
     /// [`TrainError`].
     pub fn save(&self) -> Result<(), TrainError> {
+        let params = &self.learner.params;
+        for (what, params) in [("an actor's parameter", &params.actors), ("a critic's parameter", &params.critic)] {
+            if !params.read().iter().all(|p| p.is_finite()) {
+                let (step, what, path) = (self.step, what.to_owned(), self.dir.clone());
+                return Err(TrainError::Diverged { step, what, path });
+            }
+        }
         metrics::write(&self.dir, &self.metrics)?;
         checkpoint::save(self)
     }
@@ -310,6 +319,11 @@ impl Trainer {
     /// [`TrainError::Resume`].
     pub fn resume(&mut self) -> Result<(), TrainError> {
         checkpoint::load(self)
+    }
+
+    /// The rings of delivered and of lost messages, where the run has estimators.
+    pub fn rings(&self) -> Option<[&Ring; 2]> {
+        self.dumie.as_ref().map(|d| [&d.jsd.ring, &d.club.ring])
     }
 
     fn return_mean(&self) -> Option<f64> {
@@ -330,20 +344,26 @@ pub fn train(
     stop: &AtomicBool,
 ) -> Result<Report, TrainError> {
     let config = config.resolve()?;
+    if !options.resume {
+        refuse_foreign(dir, options.force)?;
+    }
     let mut trainer = Trainer::new(config, dir)?;
     if options.resume {
         trainer.resume()?;
-    } else {
-        claim(dir, options.force)?;
     }
-    if let Some(path) = options.warm_start.filter(|_| !options.resume) {
+    if let Some(path) = options.warm_start {
         trainer.warm_start(crate::storage::open(path)?.as_mut())?;
     }
     let mut sink = match options.record {
         Some(path) => Some(crate::storage::create(path, &trainer.manifest(), options.force)?),
         None => None,
     };
+    // nothing that was there is touched before everything that can be refused has been
+    if !options.resume && dir.exists() {
+        std::fs::remove_dir_all(dir).map_err(crate::io::IoError::os("replace", dir))?;
+    }
     crate::io::write_atomic(&dir.join("config.toml"), trainer.config.to_toml()?.as_bytes())?;
+    trainer.save()?;
     let mut saved = trainer.update;
     while trainer.step < trainer.config.steps && !stop.load(Ordering::Relaxed) {
         trainer.advance(sink.as_deref_mut())?;
@@ -370,16 +390,29 @@ pub fn train(
     })
 }
 
-/// Makes the run directory; an existing run is replaced only with `force`.
-fn claim(dir: &Path, force: bool) -> Result<(), TrainError> {
+/// What a run directory may hold; anything else in it is somebody's own.
+const RUN_FILES: [&str; 7] = [
+    "config.toml",
+    "metrics.parquet",
+    "timings.parquet",
+    "evaluation.parquet",
+    "mi.parquet",
+    "events.out.tfevents.ccmarl",
+    "checkpoint",
+];
+
+/// Refuses an output directory that exists, or with `force` one that is not just a run.
+fn refuse_foreign(dir: &Path, force: bool) -> Result<(), TrainError> {
+    use crate::io::IoError;
     crate::io::refuse_existing(dir, force)?;
-    if dir.exists() {
-        let ours = dir.join("config.toml").exists();
-        let empty = std::fs::read_dir(dir).map_err(crate::io::IoError::os("list", dir))?.next().is_none();
-        if !ours && !empty {
-            return Err(crate::io::IoError::Foreign(dir.to_owned()).into());
-        }
-        std::fs::remove_dir_all(dir).map_err(crate::io::IoError::os("replace", dir))?;
+    if !dir.exists() {
+        return Ok(());
     }
-    Ok(std::fs::create_dir_all(dir).map_err(crate::io::IoError::os("create the directory", dir))?)
+    let mut names = Vec::new();
+    for entry in std::fs::read_dir(dir).map_err(IoError::os("list", dir))? {
+        names.push(entry.map_err(IoError::os("list", dir))?.file_name());
+    }
+    let known = names.iter().all(|name| RUN_FILES.iter().any(|file| name == file));
+    let run = names.is_empty() || TrainConfig::read(&dir.join("config.toml")).is_ok();
+    if known && run { Ok(()) } else { Err(IoError::Foreign(dir.to_owned()).into()) }
 }

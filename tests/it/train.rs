@@ -10,7 +10,7 @@ fn config(algorithm: &str, steps: u64) -> TrainConfig {
     let mut config = TrainConfig::new(Spec::new("simple_spread"), algorithm);
     config.steps = steps;
     config.log_every = 5;
-    config.maddpg.batch = 64;
+    config.maddpg.batch = Some(64);
     config.dumie.batch = 64;
     config
 }
@@ -45,7 +45,7 @@ fn an_interrupted_run_that_is_resumed_ends_with_the_bytes_of_an_uninterrupted_on
     let dir = tempfile::tempdir().unwrap();
     let whole = dir.path().join("whole");
     run(config("cc-maddpg", 5000), &whole, &Options::default());
-    for stop_at in [500, 1125, 3300] {
+    for stop_at in [500, 1125, 1425, 3300] {
         let parts = dir.path().join(format!("parts-{stop_at}"));
         let stop = AtomicBool::new(false);
         let mut progress = |p: ccmarl::train::Progress| {
@@ -98,10 +98,69 @@ fn a_store_of_the_runs_own_rollouts_gives_the_next_critic_loss_of_the_replay_in_
         .unwrap();
         let episodes = warm.warm_start(ccmarl::storage::open(&store).unwrap().as_mut()).unwrap();
         assert_eq!(episodes, steps / 25);
+        assert_eq!(warm.rings().is_some(), algorithm == "cc-maddpg");
         let loss = warm.next_critic_loss().unwrap().unwrap();
         assert_eq!(loss.to_bits(), trained.next_critic_loss().unwrap().unwrap().to_bits());
         assert_eq!(loss.to_bits(), report.next_critic_loss.unwrap().to_bits());
     }
+}
+
+#[test]
+fn a_warm_start_fills_the_rings_as_the_rollouts_did() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = dir.path().join("s");
+    run(config("cc-maddpg", 900), &dir.path().join("a"), &Options { record: Some(&store), ..Options::default() });
+    let resolved = config("cc-maddpg", 900).resolve().unwrap();
+    let [mut rolled, mut warm] = [(); 2].map(|()| Trainer::new(resolved.clone(), dir.path()).unwrap());
+    for _ in 0..36 {
+        rolled.advance(None).unwrap();
+    }
+    warm.warm_start(ccmarl::storage::open(&store).unwrap().as_mut()).unwrap();
+    let [delivered, lost] = warm.rings().unwrap();
+    assert_eq!(warm.rings(), rolled.rings());
+    assert!(delivered.len() == 1000 && lost.len() > 500, "{} and {}", delivered.len(), lost.len());
+}
+
+#[test]
+fn logging_more_often_changes_no_network() {
+    let dir = tempfile::tempdir().unwrap();
+    let [a, b] = ["a", "b"].map(|name| dir.path().join(name));
+    run(config("cc-maddpg", 4000), &a, &Options::default());
+    let mut often = config("cc-maddpg", 4000);
+    often.log_every = 1;
+    run(often, &b, &Options::default());
+    assert!(bytes(&a, LEARNED[0]) == bytes(&b, LEARNED[0]));
+}
+
+#[test]
+fn force_replaces_a_run_and_nothing_else() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("run");
+    run(config("maddpg", 500), &path, &Options::default());
+    let force = Options { force: true, ..Options::default() };
+    let again =
+        |options: &Options<'_>| train(config("maddpg", 500), &path, options, &mut |_| {}, &AtomicBool::new(false));
+    assert!(again(&Options::default()).unwrap_err().to_string().starts_with("output exists"));
+    let missing = dir.path().join("nosuch");
+    let refused = again(&Options { warm_start: Some(&missing), ..Options { force: true, ..Options::default() } });
+    assert!(refused.unwrap_err().to_string().contains("no such file"));
+    assert!(path.join("metrics.parquet").exists(), "a refused command removed the run");
+    again(&force).unwrap();
+    ccmarl::io::write_atomic(&path.join("thesis.tex"), b"mine").unwrap();
+    assert!(again(&force).unwrap_err().to_string().contains("ccmarl did not make"));
+    assert_eq!(bytes(&path, "thesis.tex"), b"mine");
+}
+
+#[test]
+fn six_predators_train_with_the_papers_smaller_batch() {
+    let batch = |scenario: &str, agents: u32| {
+        let spec = Spec::new(scenario).with("agents", agents);
+        TrainConfig::new(spec, "cc-maddpg").resolve().unwrap().maddpg.batch
+    };
+    assert_eq!(
+        [batch("simple_tag", 3), batch("simple_tag", 6), batch("simple_spread", 6)],
+        [Some(1024), Some(512), Some(1024)]
+    );
 }
 
 #[test]
