@@ -51,7 +51,8 @@ impl Error {
         let exists = |e: &IoError| matches!(e, IoError::Exists(_));
         match self {
             Self::Pairs(error) => error.is_usage(),
-            Self::Registry(_)
+            Self::Registry(e) | Self::Train(TrainError::Registry(e)) => !matches!(e, RegistryError::Data(_)),
+            Self::Usage(_)
             | Self::Record(RecordError::NoEpisodes)
             | Self::Report(ReportError::NoInput)
             | Self::Train(TrainError::Config { .. } | TrainError::Value { .. }) => true,
