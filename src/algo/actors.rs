@@ -9,10 +9,11 @@ use std::path::{Path, PathBuf};
 use candle_core::{DType, Device};
 use candle_nn::VarBuilder;
 use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
 
 use crate::nn::{Activation, Mlp, NnError, Tape, from_tensors, to_tensors};
 use crate::rng::Stream;
-use crate::schema::AgentSpec;
+use crate::schema::{AgentSpec, hex};
 
 /// Version of the actor file.
 const FILE_VERSION: u32 = 1;
@@ -29,6 +30,10 @@ struct Header {
     messages: bool,
     hidden_activation: String,
     output_activation: String,
+    /// Environment steps that trained them.
+    steps: u64,
+    /// SHA-256 of all parameters in order, little-endian.
+    sha256: String,
 }
 
 impl Header {
@@ -58,6 +63,15 @@ pub enum RunPolicyError {
     },
 }
 
+/// SHA-256 of parameters, little-endian, 64 hex digits.
+fn digest(params: &[f32]) -> String {
+    let mut hash = Sha256::new();
+    for value in params {
+        hash.update(value.to_le_bytes());
+    }
+    hex(&hash.finalize())
+}
+
 /// One actor network per learner, all parameters in one flat vector.
 #[derive(Clone, Debug)]
 pub struct Actors {
@@ -71,6 +85,8 @@ pub struct Actors {
     pub networks: Vec<Mlp>,
     /// Where each network starts in the flat parameters; the total is last.
     pub offsets: Vec<usize>,
+    /// Environment steps that trained the parameters these shapes were read with; 0 for fresh ones.
+    pub steps: u64,
 }
 
 impl Actors {
@@ -96,7 +112,7 @@ impl Actors {
         for network in &networks {
             offsets.push(offsets[offsets.len() - 1] + network.parameters());
         }
-        Self { names, observation, messages, networks, offsets }
+        Self { names, observation, messages, networks, offsets, steps: 0 }
     }
 
     /// Learners.
@@ -160,11 +176,11 @@ impl Actors {
     }
 
     /// Writes the actors as safetensors: `actor.<name>.<layer>.weight` `[outputs, inputs]`, `….bias`, and what a
-    /// reader must know as metadata.
+    /// reader must know as metadata; `steps` environment steps trained them.
     ///
     /// # Errors
     /// [`NnError`].
-    pub fn to_bytes(&self, params: &[f32]) -> Result<Vec<u8>, NnError> {
+    pub fn to_bytes(&self, params: &[f32], steps: u64) -> Result<Vec<u8>, NnError> {
         let mut tensors = BTreeMap::new();
         for (i, network) in self.networks.iter().enumerate() {
             to_tensors(&format!("actor.{}", self.names[i]), network, self.slice(params, i), &mut tensors)?;
@@ -176,6 +192,8 @@ impl Actors {
             messages: self.messages,
             hidden_activation: "relu".to_owned(),
             output_activation: "tanh".to_owned(),
+            steps,
+            sha256: digest(params),
         };
         // one key only: the crate keeps metadata in a hash map, whose order would change the bytes
         let metadata = [(HEADER.to_owned(), header.to_json()?)];
@@ -203,7 +221,7 @@ impl Actors {
         let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).map_err(|e| e.to_string())?;
         let metadata = header.metadata().clone().unwrap_or_default();
         let json = metadata.get(HEADER).ok_or_else(|| format!("the metadata key {HEADER:?} is missing"))?;
-        let Header { version, learners: names, observation, messages, .. } =
+        let Header { version, learners: names, observation, messages, steps, sha256, .. } =
             serde_json::from_str(json).map_err(|e| format!("the metadata key {HEADER:?}: {e}"))?;
         if version != FILE_VERSION {
             return Err(format!("actor file version {version} is not {FILE_VERSION}"));
@@ -235,7 +253,10 @@ impl Actors {
         for (name, network) in names.iter().zip(&networks) {
             from_tensors(&builder, &format!("actor.{name}"), network, &mut params).map_err(|e| e.to_string())?;
         }
-        Ok((Self::assemble(names, observation, messages, networks), params))
+        if digest(&params) != sha256 {
+            return Err("its parameters do not match their digest: the file was changed or damaged".to_owned());
+        }
+        Ok((Self { steps, ..Self::assemble(names, observation, messages, networks) }, params))
     }
 
     /// Checks that these actors fit the learners of a scenario.
@@ -299,10 +320,16 @@ mod tests {
         let agents: Vec<&AgentSpec> = agents.iter().collect();
         let actors = Actors::new(&agents, &[8, 8], true);
         let params = actors.init(&mut Seeds::new(1).stream("actors"));
-        let bytes = actors.to_bytes(&params).unwrap();
-        assert!(bytes == actors.to_bytes(&params).unwrap());
+        let bytes = actors.to_bytes(&params, 25).unwrap();
+        assert!(bytes == actors.to_bytes(&params, 25).unwrap());
         let (read, again) = Actors::from_bytes(bytes.clone()).unwrap();
-        assert_eq!((again, read.networks), (params, actors.networks.clone()));
+        assert_eq!((&again, &read.networks), (&params, &actors.networks));
+        assert_eq!(read.steps, 25);
+        for bit in (bytes.len() * 8 - params.len() * 32..bytes.len() * 8).step_by(37) {
+            let mut flipped = bytes.clone();
+            flipped[bit / 8] ^= 1 << (bit % 8);
+            assert!(Actors::from_bytes(flipped).is_err_and(|e| e.contains("digest")), "bit {bit}");
+        }
         for cut in [0, 7, 8, 100, bytes.len() - 1] {
             assert!(Actors::from_bytes(bytes[..cut].to_vec()).is_err());
         }

@@ -84,7 +84,7 @@ type Write = fn(&[Estimate]) -> Result<Vec<u8>, String>;
 
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let plan = plan(args)?;
-    let write = args.out.as_deref().map(|path| writer(path, args.force)).transpose()?;
+    let write = args.out.as_deref().map(|path| writer(path, &args.path, args.force)).transpose()?;
     let samples = samples(args)?;
     let threads = usize::from(args.threads);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().context("could not start threads")?;
@@ -121,7 +121,12 @@ fn plan(args: &Args) -> Result<Plan, Error> {
     Ok(Plan { estimators, protocol: Protocol { permutations: args.permutations as usize }, seed: args.seed })
 }
 
-fn writer(path: &Path, force: bool) -> anyhow::Result<Write> {
+fn writer(path: &Path, input: &Path, force: bool) -> anyhow::Result<Write> {
+    let real = |p: &Path| p.canonicalize().ok();
+    if real(path).is_some() && real(path) == real(input) {
+        let message = format!("--out would replace the input: {}", path.display());
+        return Err(Error::Usage(message).into());
+    }
     io::refuse_existing(path, force).map_err(Error::from)?;
     let forms: [(&str, Write); 3] = [("json", mi::to_json), ("csv", mi::to_csv), ("parquet", mi::to_parquet)];
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());

@@ -6,9 +6,10 @@ use serde_json::json;
 
 use super::{Outcome, ui};
 use crate::Error;
+use crate::algo::Actors;
 use crate::io::IoError;
 use crate::link::suite;
-use crate::registry::Spec;
+use crate::registry::{RegistryError, Spec};
 use crate::scenario;
 use crate::train::{TrainConfig, TrainError, evaluate, write_evaluation};
 
@@ -40,10 +41,21 @@ pub(super) struct Args {
 /// Runs the command.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let file = args.run.join("config.toml");
+    if args.run.exists() && !file.exists() {
+        let message = "not a run directory (it holds no config.toml); give what `ccmarl train --out` wrote";
+        anyhow::bail!("{message}: {}", args.run.display());
+    }
     if !file.exists() {
-        return Err(Error::from(IoError::Missing(file)).into());
+        return Err(Error::from(IoError::Missing(args.run.clone())).into());
     }
     let config = TrainConfig::read(&file).and_then(TrainConfig::resolve).map_err(Error::from)?;
+    let trained = Actors::load(&args.run).map_err(|e| Error::from(RegistryError::Data(e.to_string())))?.0.steps;
+    if trained < config.steps {
+        ui::say(&format!(
+            "warning: trained for {trained} of {} steps; go on with `ccmarl train --resume`",
+            config.steps
+        ));
+    }
     let channels = suite(&args.suite).map_err(Error::from)?;
     let policy = Spec::new("run").with("path", args.run.to_string_lossy());
     let bar = ui::progress(channels.len() as u64, "channels");

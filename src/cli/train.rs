@@ -16,10 +16,11 @@ Examples:
   ccmarl train --scenario simple_spread --algorithm cc-maddpg --steps 400000 --seed 1 --out runs/x
   ccmarl train --scenario simple_tag --agents 6 --algorithm cc-maddpg --prior markov:heavy --out runs/matched
   ccmarl train --config run.toml --out runs/y
-  ccmarl train --config runs/x/config.toml --out runs/x --resume
+  ccmarl train --out runs/x --resume
 
-The run directory holds config.toml (fully resolved), metrics.parquet, TensorBoard events and checkpoint/. Ctrl-C saves
-and exits 4; --resume goes on from there, to the same bytes as a run that was never stopped.";
+The run directory holds config.toml (fully resolved), metrics.parquet, TensorBoard events and checkpoint/, saved every
+2000 updates and at the end. Ctrl-C saves and exits 4; --resume reads the run's own config.toml and goes on from its last
+checkpoint, to the same bytes as a run that was never stopped.";
 
 /// Arguments of `train`.
 #[derive(Debug, clap::Args)]
@@ -57,7 +58,7 @@ pub(super) struct Args {
     /// Store that takes the run's own rollouts
     #[arg(long, value_name = "STORE", conflicts_with = "resume")]
     record: Option<PathBuf>,
-    /// Go on from the checkpoint in --out
+    /// Go on from the checkpoint in --out, under its own configuration
     #[arg(long, conflicts_with = "force")]
     resume: bool,
     /// Replace the run if it exists
@@ -71,7 +72,8 @@ pub(super) struct Args {
 impl Args {
     /// The configuration: the file's, then the flags'.
     fn config(&self) -> Result<TrainConfig, Error> {
-        let file = self.config.as_deref().map(TrainConfig::read).transpose()?;
+        let own = self.resume.then(|| self.out.join("config.toml"));
+        let file = self.config.as_deref().or(own.as_deref()).map(TrainConfig::read).transpose()?;
         let spec = self.scenario.spec(file.as_ref().map(|c| c.scenario.clone()))?;
         let spec = spec.unwrap_or_else(|| Spec::new("simple_spread"));
         let mut config = file.unwrap_or_else(|| TrainConfig::new(spec.clone(), "cc-maddpg"));
@@ -125,9 +127,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         }
     }
     if report.interrupted {
-        ui::say(&format!(
-            "interrupted and saved; go on with: ccmarl train --config {out}/config.toml --out {out} --resume"
-        ));
+        ui::say(&format!("interrupted and saved; go on with: ccmarl train --out {out} --resume"));
         return Ok(Outcome::Interrupted);
     }
     ui::say(&format!("next: ccmarl evaluate {out} --suite paper"));

@@ -44,7 +44,7 @@ fn put_adam(tensors: &mut Tensors, name: &str, adam: &Adam) -> Result<(), TrainE
 pub(super) fn save(trainer: &Trainer) -> Result<(), TrainError> {
     let dir = trainer.dir.join("checkpoint");
     let learner = &trainer.learner;
-    let actors = learner.actors.to_bytes(&learner.params.actors.read())?;
+    let actors = learner.actors.to_bytes(&learner.params.actors.read(), trainer.step)?;
     crate::io::write_atomic(&dir.join("actors.safetensors"), &actors)?;
 
     let mut tensors = Tensors::new();

@@ -68,6 +68,7 @@ fn errors_name_the_remedy_and_have_the_right_exit_code() {
         (2, &[&table, "--x", "a", "--y", "b", "--estimator", "jsd:3"], "takes no value"),
         (2, &[&table, "--x", "a", "--y", "b", "--delivered"], "--delivered"),
         (2, &[&table, "--x", "a", "--y", "b", "--out", &there], "output exists: give --force"),
+        (2, &[&table, "--x", "a", "--y", "b", "--out", &table, "--force"], "--out would replace the input"),
         (
             2,
             &[&table, "--x", "a", "--y", "b", "--out", "x.txt"],
