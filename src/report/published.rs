@@ -114,9 +114,7 @@ pub(super) fn coefficients(run: &Run) -> (Option<f64>, Option<f64>) {
 fn unchanged(run: &Run) -> bool {
     let name = run.scenario.name.as_str();
     match crate::scenario::build(&Spec::new(name).with("agents", run.task.agents)) {
-        Ok(default) => {
-            crate::scenario::build(&run.scenario).is_ok_and(|own| own.parameters() == default.parameters())
-        }
+        Ok(default) => crate::scenario::build(&run.scenario).is_ok_and(|own| own.parameters() == default.parameters()),
         // a scenario that this build does not know: no more than these can be judged
         Err(_) => run.scenario.params.keys().all(|key| ["name", "profile", "agents"].contains(&key.as_str())),
     }
