@@ -1,8 +1,12 @@
 //! Files: atomic writes, directories that appear whole, digests.
 
+use std::cell::Cell;
 use std::fs::File;
 use std::io::{Read as _, Write as _};
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
+use std::sync::Once;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use sha2::{Digest as _, Sha256};
 
@@ -92,13 +96,18 @@ pub fn create_parent(path: &Path) -> Result<(), IoError> {
 
 /// The sibling `.<name>.partial` in which an output is built before it takes its name.
 pub fn partial_path(path: &Path) -> PathBuf {
+    hidden_sibling(path, "partial")
+}
+
+fn hidden_sibling(path: &Path, ending: &str) -> PathBuf {
     let name = path.file_name().map_or_else(|| "out".into(), |n| n.to_string_lossy().into_owned());
-    path.with_file_name(format!(".{name}.partial"))
+    path.with_file_name(format!(".{name}.{ending}"))
 }
 
 /// Puts a finished file or directory under its final name, replacing what `force` allows it to replace.
 ///
-/// A directory is replaced only if it is empty or holds `marker` (the file that says that ccmarl made it).
+/// A directory is replaced only if it is empty or holds `marker` (the file that says that ccmarl made it). It is first
+/// renamed to `.<name>.replaced`, and deleted once the new one is in place.
 ///
 /// # Errors
 /// [`IoError::Exists`], [`IoError::Foreign`], [`IoError::Os`].
@@ -109,12 +118,29 @@ pub fn publish(from: &Path, to: &Path, force: bool, marker: &str) -> Result<(), 
         if !empty && !to.join(marker).exists() {
             return Err(IoError::Foreign(to.to_owned()));
         }
-        std::fs::remove_dir_all(to).map_err(IoError::os("replace", to))?;
-    } else if from.is_dir() && to.symlink_metadata().is_ok() {
-        std::fs::remove_file(to).map_err(IoError::os("replace", to))?;
     }
-    std::fs::rename(from, to).map_err(IoError::os("put in place", to))?;
-    sync_dir(to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")))
+    // a rename replaces a file by a file in one step; all else takes two, and a kill between them must lose nothing
+    let aside = hidden_sibling(to, "replaced");
+    let two_steps = to.symlink_metadata().is_ok() && (to.is_dir() || from.is_dir());
+    if two_steps {
+        remove(&aside)?;
+        std::fs::rename(to, &aside).map_err(IoError::os("set aside", to))?;
+    }
+    if let Err(error) = std::fs::rename(from, to) {
+        if two_steps {
+            std::fs::rename(&aside, to).map_err(IoError::os("put back", to))?;
+        }
+        return Err(IoError::os("put in place", to)(error));
+    }
+    sync_dir(to.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")))?;
+    if two_steps { remove(&aside) } else { Ok(()) }
+}
+
+/// Removes a file, a link (not what it points to) or a directory, if it is there.
+fn remove(path: &Path) -> Result<(), IoError> {
+    let Ok(found) = path.symlink_metadata() else { return Ok(()) };
+    let removed = if found.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
+    removed.map_err(IoError::os("remove", path))
 }
 
 /// Makes a rename in `dir` durable.
@@ -148,4 +174,77 @@ pub fn sha256_file(path: &Path) -> Result<(String, u64), IoError> {
 /// Text that came from a file, safe to print on a terminal: control characters are shown escaped.
 pub fn printable(text: &str) -> String {
     text.chars().flat_map(|c| if c.is_control() { c.escape_default().collect() } else { vec![c] }).collect()
+}
+
+/// Calls of [`caught`] under way.
+static CAUGHT: AtomicUsize = AtomicUsize::new(0);
+static HOOK: Once = Once::new();
+
+std::thread_local! {
+    /// Whether this thread is inside [`caught`].
+    static INSIDE: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Calls a foreign reader; `None` when it panics, as polars does on some damaged files.
+///
+/// The panic's message is not printed. Only this thread and polars' own workers are silenced, and only meanwhile.
+pub fn caught<T>(read: impl FnOnce() -> T) -> Option<T> {
+    HOOK.call_once(|| {
+        let print = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |panic| {
+            let worker = || std::thread::current().name().is_some_and(|name| name.starts_with("polars"));
+            if !(INSIDE.get() || CAUGHT.load(Ordering::SeqCst) > 0 && worker()) {
+                print(panic);
+            }
+        }));
+    });
+    let outer = INSIDE.replace(true);
+    CAUGHT.fetch_add(1, Ordering::SeqCst);
+    let result = catch_unwind(AssertUnwindSafe(read));
+    CAUGHT.fetch_sub(1, Ordering::SeqCst);
+    INSIDE.set(outer);
+    result.ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names(dir: &Path) -> Vec<String> {
+        let mut names: Vec<String> =
+            std::fs::read_dir(dir).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn a_directory_is_replaced_only_with_its_marker_and_leaves_nothing_beside_it() {
+        let dir = tempfile::tempdir().unwrap();
+        let (from, to) = (dir.path().join("new"), dir.path().join("out"));
+        let fill = |path: &Path, text: &str| write_atomic(path, text.as_bytes()).unwrap();
+        fill(&from.join("marker"), "new");
+        fill(&to.join("thesis.tex"), "old");
+        assert!(matches!(publish(&from, &to, true, "marker"), Err(IoError::Foreign(_))));
+        assert_eq!(names(dir.path()), ["new", "out"]);
+        fill(&to.join("marker"), "old");
+        fill(&dir.path().join(".out.replaced/left"), "by a kill");
+        publish(&from, &to, true, "marker").unwrap();
+        assert_eq!((names(dir.path()), names(&to)), (vec!["out".to_owned()], vec!["marker".to_owned()]));
+    }
+
+    #[test]
+    fn what_cannot_be_replaced_is_put_back() {
+        let dir = tempfile::tempdir().unwrap();
+        let to = dir.path().join("out");
+        write_atomic(&to.join("marker"), b"old").unwrap();
+        let error = publish(&dir.path().join("gone"), &to, true, "marker").unwrap_err().to_string();
+        assert!(error.starts_with("could not put in place: "), "{error}");
+        assert_eq!((names(dir.path()), names(&to)), (vec!["out".to_owned()], vec!["marker".to_owned()]));
+    }
+
+    #[test]
+    fn a_panic_of_a_reader_is_none() {
+        assert_eq!(caught(|| 7), Some(7));
+        assert_eq!(caught(|| [1, 2][std::hint::black_box(2)]), None);
+    }
 }

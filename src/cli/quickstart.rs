@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use clap::Parser as _;
 
-use super::{Cli, Outcome, dispatch, ui};
+use super::{Cli, Command, Outcome, dispatch, report, ui};
 use crate::io;
 
 const HELP: &str = "\
@@ -15,6 +15,10 @@ ordinary command and is shown as it runs. About a minute on two cores.";
 
 /// What says that a directory was made by this command.
 const MARKER: &str = "quickstart.txt";
+
+/// All that may lie in a directory of ours; `report` only until its page is moved up.
+const OURS: [&str; 9] =
+    [MARKER, "runs", "data", "report", "index.html", "command.txt", "provenance.json", "figures", "tables"];
 
 /// Arguments of `quickstart`.
 #[derive(Debug, clap::Args)]
@@ -57,37 +61,65 @@ fn commands(dir: &str) -> Vec<Vec<String>> {
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let started = Instant::now();
     prepare(&args.out, args.force)?;
-    let dir = args.out.to_string_lossy().into_owned();
+    let made = make(&args.out);
+    // half a quick start is of no use, and cannot go on
+    if !matches!(made, Ok(Outcome::Done | Outcome::DataLost)) {
+        std::fs::remove_dir_all(&args.out).map_err(io::IoError::os("remove the unfinished", &args.out))?;
+    }
+    let outcome = made?;
+    let seconds = started.elapsed().as_secs_f64();
+    match outcome {
+        Outcome::Done => ui::say(&format!(
+            "\nmade {}/index.html in {seconds:.0} s: two trained teams, four stores, their mutual information, eight \
+             channels.\nnext: open the page; then train for longer (--steps 4000000), on simple_tag, or with your own \
+             channel (--prior markov:heavy)",
+            args.out.display()
+        )),
+        Outcome::Interrupted => ui::say(&format!(
+            "interrupted: removed {}; the same command starts again from the beginning",
+            args.out.display()
+        )),
+        Outcome::DataLost => {}
+    }
+    Ok(outcome)
+}
+
+/// Runs the commands, then moves the page to the top of the directory.
+fn make(out: &Path) -> anyhow::Result<Outcome> {
+    let dir = out.to_string_lossy().into_owned();
     for words in commands(&dir) {
         ui::say(&format!("\n$ ccmarl {}", words.join(" ")));
         let cli = Cli::try_parse_from(std::iter::once("ccmarl".to_owned()).chain(words))?;
-        match dispatch(cli.command)? {
-            Outcome::Done => {}
-            other => return Ok(other),
+        let outcome = match cli.command {
+            // where the page lies is said below, once it is there
+            Command::Report(args) => report::make(&args).map(|_| Outcome::Done)?,
+            command => dispatch(command)?,
+        };
+        if outcome != Outcome::Done {
+            return Ok(outcome);
         }
     }
     // the page belongs at the top of the directory, beside the runs and stores it was made from
-    let report = args.out.join("report");
+    let report = out.join("report");
     for entry in std::fs::read_dir(&report).map_err(io::IoError::os("list", &report))? {
         let from = entry?.path();
         if let Some(name) = from.file_name() {
-            std::fs::rename(&from, args.out.join(name)).map_err(io::IoError::os("move", &from))?;
+            std::fs::rename(&from, out.join(name)).map_err(io::IoError::os("move", &from))?;
         }
     }
     std::fs::remove_dir(&report).map_err(io::IoError::os("remove", &report))?;
-    ui::say(&format!(
-        "\nmade {dir}/index.html in {:.0} s: two trained teams, four stores, their mutual information, eight channels.\n\
-         next: open the page; then train for longer (--steps 4000000), on simple_tag, or with your own channel (--prior markov:heavy)",
-        started.elapsed().as_secs_f64()
-    ));
     Ok(Outcome::Done)
 }
 
-/// Makes the directory; what an earlier quick start left is replaced only with `force`.
+/// Makes the directory; what an earlier quick start left is replaced only with `force`, and only if nothing else is in it.
 fn prepare(out: &Path, force: bool) -> anyhow::Result<()> {
     io::refuse_existing(out, force).map_err(crate::Error::from)?;
     if out.exists() {
-        if !out.join(MARKER).exists() {
+        let mut foreign = !out.join(MARKER).exists();
+        for entry in std::fs::read_dir(out).map_err(io::IoError::os("list", out))? {
+            foreign |= !OURS.contains(&entry?.file_name().to_string_lossy().as_ref());
+        }
+        if foreign {
             return Err(crate::Error::from(io::IoError::Foreign(out.to_owned())).into());
         }
         std::fs::remove_dir_all(out).map_err(io::IoError::os("replace", out))?;

@@ -40,6 +40,13 @@ pub(super) struct ReportArgs {
 }
 
 pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
+    let summary = make(args)?;
+    ui::say(&format!("{} figures and the tables are on {}", summary.figures, summary.page.display()));
+    Ok(Outcome::Done)
+}
+
+/// Writes the report and prints the summary, but not where it lies.
+pub(super) fn make(args: &ReportArgs) -> anyhow::Result<Summary> {
     crate::io::refuse_existing(&args.out, args.force).map_err(crate::Error::from)?;
     let collected = collect(&args.runs, &args.mi).map_err(crate::Error::from)?;
     let command = command_line(std::env::args_os().map(|a| a.to_string_lossy().into_owned()));
@@ -51,8 +58,7 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
         Format::Json => ui::print_json(&summary.tidy())?,
         Format::Table => print_table(&summary)?,
     }
-    ui::say(&format!("{} figures and the tables are on {}", summary.figures, summary.page.display()));
-    Ok(Outcome::Done)
+    Ok(summary)
 }
 
 /// Returns of random policy and oracle on every task of the runs; a task that this build cannot play has none.
@@ -92,7 +98,11 @@ fn print_table(summary: &Summary) -> anyhow::Result<()> {
         let mut rows = Vec::new();
         for row in &table.rows {
             let mut line = vec![row.series.clone(), row.seeds.len().to_string()];
-            line.extend(row.cells.iter().map(|c| c.as_ref().map_or("-".to_owned(), |c| format!("{:.1}", c.mean))));
+            line.extend(
+                row.cells
+                    .iter()
+                    .map(|c| c.as_ref().map_or("-".to_owned(), |c| format!("{:.1}{}", c.mean, c.seeds_label(row)))),
+            );
             rows.push(line);
         }
         for (name, mean, ..) in &table.references {

@@ -58,9 +58,11 @@ pub(super) fn print_table(header: &[&str], rows: &[Vec<String>]) -> anyhow::Resu
     print(&text.lines().map(str::trim_end).collect::<Vec<_>>().join("\n"))
 }
 
-/// Says something to the user on stderr.
+/// Says something to the user on stderr; control characters of the lines, which may come from a file, are escaped.
 pub(super) fn say(text: &str) {
-    eprintln!("{text}");
+    for line in text.split('\n') {
+        eprintln!("{}", crate::io::printable(line));
+    }
 }
 
 /// A progress bar with rate and ETA on stderr; silent when stderr is no terminal.

@@ -2,7 +2,6 @@
 
 use std::fs::File;
 use std::io::Read as _;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -147,11 +146,7 @@ fn form(path: &Path) -> Result<&'static str, IoError> {
 /// Runs what touches a foreign file's data; a panic in there becomes an error of ours.
 fn caught<T>(path: &Path, read: impl FnOnce(&'static str) -> Result<T, PairsError>) -> Result<T, PairsError> {
     let form = form(path)?;
-    let hook = std::panic::take_hook();
-    std::panic::set_hook(Box::new(|_| ()));
-    let result = catch_unwind(AssertUnwindSafe(|| read(form)));
-    std::panic::set_hook(hook);
-    result.unwrap_or_else(|_| {
+    crate::io::caught(|| read(form)).unwrap_or_else(|| {
         Err(PairsError::Unreadable { form, message: "the file is damaged".to_owned(), path: path.to_owned() })
     })
 }

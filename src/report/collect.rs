@@ -8,7 +8,7 @@ use serde::Deserialize;
 use crate::io::{IoError, printable, read_text, sha256_file};
 use crate::registry::Spec;
 use crate::report::ReportError;
-use crate::report::columns::Columns;
+use crate::report::columns::{Columns, guarded};
 use crate::report::mutual::{self, MutualFile};
 
 /// How deep runs are looked for below a given directory.
@@ -142,11 +142,11 @@ pub fn collect(inputs: &[PathBuf], mi: &[PathBuf]) -> Result<Collected, ReportEr
         collected.runs.push(read_run(path)?);
         let table = path.join("mi.parquet");
         if table.exists() {
-            collected.mutual.push(mutual::read(&table)?);
+            collected.mutual.push(guarded(&table, || mutual::read(&table))?);
         }
     }
     for path in mi {
-        collected.mutual.push(mutual::read(path)?);
+        collected.mutual.push(guarded(path, || mutual::read(path))?);
     }
     Ok(collected)
 }
@@ -261,10 +261,10 @@ fn read_run(path: &Path) -> Result<Run, ReportError> {
         return Err(ReportError::EmptyRun(path.to_owned()));
     }
     if metrics.exists() {
-        read_training(&metrics, &mut run)?;
+        guarded(&metrics, || read_training(&metrics, &mut run))?;
     }
     if evaluation.exists() {
-        read_evaluation(&evaluation, &mut run)?;
+        guarded(&evaluation, || read_evaluation(&evaluation, &mut run))?;
     }
     Ok(run)
 }

@@ -14,6 +14,13 @@ pub(super) struct Columns {
     path: PathBuf,
 }
 
+/// Runs what touches a foreign table; a panic of the Parquet reader on a damaged file becomes an error of ours.
+pub(super) fn guarded<T>(path: &Path, read: impl FnOnce() -> Result<T, ReportError>) -> Result<T, ReportError> {
+    crate::io::caught(read).unwrap_or_else(|| {
+        Err(ReportError::Parquet { message: "the file is damaged".to_owned(), path: path.to_owned() })
+    })
+}
+
 impl Columns {
     /// Reads a whole Parquet file.
     pub(super) fn open(path: &Path) -> Result<Self, ReportError> {

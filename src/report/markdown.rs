@@ -38,7 +38,8 @@ pub(super) fn grid(returns: &Returns) -> Grid {
                 }
                 continue;
             };
-            ours.push((format!("{:.1} ± {:.1}", cell.mean, cell.spread()), cell.best));
+            let seeds = cell.seeds_label(row);
+            ours.push((format!("{:.1} ± {:.1}{seeds}", cell.mean, cell.spread()), cell.best));
             published.push(plain(cell.published.map_or("–".to_owned(), |p| format!("{:.1} ± {:.1}", p.mean, p.sd))));
             difference.push(plain(cell.published.map_or("–".to_owned(), |p| format!("{:+.1}", cell.mean - p.mean))));
         }

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
+use crate::registry::Spec;
 use crate::report::{ReportError, Run, Task};
 
 const PERFORMANCE: &str = include_str!("../../datasets/paper/performance.csv");
@@ -71,9 +72,10 @@ impl Tables {
     }
 
     /// The published cell of a run's settings under `channel`. None for the channel `none`, for other profiles than
-    /// `paper`, and for settings that the paper has no row for.
+    /// `paper`, for a changed scenario, and for settings that the paper has no row for. The number of steps is not
+    /// compared: shorter trainings are noted.
     pub fn of(&self, run: &Run, channel: &str) -> Option<Published> {
-        if run.task.profile != "paper" {
+        if run.task.profile != "paper" || !unchanged(run) {
             return None;
         }
         let agents = agents_in_paper(&run.task);
@@ -108,8 +110,39 @@ pub(super) fn coefficients(run: &Run) -> (Option<f64>, Option<f64>) {
     (get("beta"), get("alpha"))
 }
 
-/// The row of the paper that a run reproduces: same preset, same prior, same terms switched on.
+/// Whether a run's scenario is what its name stands for at that number of agents, without overrides.
+fn unchanged(run: &Run) -> bool {
+    let name = run.scenario.name.as_str();
+    match crate::scenario::build(&Spec::new(name).with("agents", run.task.agents)) {
+        Ok(default) => crate::scenario::build(&run.scenario).is_ok_and(|own| own.parameters() == default.parameters()),
+        // a scenario that this build does not know: no more than these can be judged
+        Err(_) => run.scenario.params.keys().all(|key| ["name", "profile", "agents"].contains(&key.as_str())),
+    }
+}
+
+/// World units of one unit of the distance channels.
+fn distance_unit(run: &Run) -> f64 {
+    crate::scenario::build(&run.scenario).map_or(0.25, |scenario| scenario.link_unit())
+}
+
+/// The row of the paper that a run reproduces: same preset, same prior, same coefficients or terms switched off.
+/// Coefficients that the configuration does not name are the preset's.
 fn row(run: &Run, channel: &str) -> Option<String> {
+    let (beta, alpha) = coefficients(run);
+    let (beta, alpha) = if run.algorithm == "cc-maddpg" {
+        let preset = (if run.task.scenario == "simple_tag" { 0.001 } else { 0.01 }, 0.01);
+        let found = (beta.unwrap_or(preset.0), alpha.unwrap_or(preset.1));
+        let fits = |found: f64, preset: f64| found == 0.0 || found == preset;
+        if !fits(found.0, preset.0) || !fits(found.1, preset.1) {
+            return None;
+        }
+        found
+    } else {
+        if [beta, alpha].iter().flatten().any(|c| *c != 0.0) {
+            return None;
+        }
+        (0.0, 0.0)
+    };
     let number = |key: &str| run.prior.params.get(key).and_then(serde_json::Value::as_f64);
     let dropout = |p: f64| run.prior.name == "dropout" && number("p") == Some(p);
     let preset = match run.algorithm.as_str() {
@@ -120,14 +153,14 @@ fn row(run: &Run, channel: &str) -> Option<String> {
         "dropout-maddpg-0.8" => dropout(0.8),
         _ => false,
     };
-    let off = match coefficients(run) {
-        (Some(beta), Some(alpha)) if beta == 0.0 || alpha == 0.0 => Some(ablation_row((beta, alpha))),
-        _ => None,
-    };
-    match (preset, off) {
-        (true, Some(off)) if run.algorithm == "cc-maddpg" => Some(off),
-        (true, _) => Some(run.algorithm.clone()),
-        (false, None) if run.algorithm == "cc-maddpg" && run.prior.name == "distance" => {
+    let shaped = beta != 0.0 && alpha != 0.0;
+    match (preset, run.algorithm.as_str()) {
+        (true, "cc-maddpg") if !shaped => Some(ablation_row((beta, alpha))),
+        (true, name) => Some(name.to_owned()),
+        (false, "cc-maddpg") if shaped && run.prior.name == "distance" => {
+            if number("unit").is_some_and(|unit| unit != distance_unit(run)) {
+                return None;
+            }
             let matched = match channel {
                 "dbc-light" => 5.0,
                 "dbc-medium" => 3.0,
@@ -206,7 +239,6 @@ pub(super) fn misprints(task: &Task, shown: &[(String, String, Published)]) -> V
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::registry::Spec;
 
     pub(crate) fn run(scenario: &str, agents: i64, algorithm: &str, prior: Spec) -> Run {
         Run {
@@ -216,7 +248,7 @@ pub(super) mod tests {
             steps: 1000,
             algorithm: algorithm.to_owned(),
             task: Task { scenario: scenario.to_owned(), profile: "paper".to_owned(), agents },
-            scenario: Spec::new(scenario),
+            scenario: Spec::new(scenario).with("agents", agents),
             prior,
             config_sha256: String::new(),
             settings: BTreeMap::new(),
@@ -251,6 +283,28 @@ pub(super) mod tests {
         ablated.settings.insert("dumie.alpha".to_owned(), "0.0".to_owned());
         ablated.settings.insert("dumie.beta".to_owned(), "0.001".to_owned());
         assert_eq!(cell(&ablated, "unrestricted"), Some((120.5, 82.1, "ablation")));
+        let set = |run: &Run, key: &str, value: &str| {
+            let mut run = run.clone();
+            run.settings.insert(key.to_owned(), value.to_owned());
+            run
+        };
+        assert_eq!(cell(&set(&cc, "dumie.beta", "0.001"), "unrestricted"), Some((134.7, 89.9, "performance")));
+        assert_eq!(cell(&set(&cc, "dumie.beta", "0.01"), "unrestricted"), None, "simple_spread's coefficient");
+        assert_eq!(cell(&set(&ablated, "dumie.beta", "0.5"), "unrestricted"), None, "no such ablation");
+        let fc = run("simple_tag", 3, "fc-maddpg", Spec::new("perfect"));
+        assert_eq!(cell(&set(&fc, "dumie.alpha", "0.0"), "unrestricted"), Some((75.9, 65.3, "performance")));
+        assert_eq!(cell(&set(&fc, "dumie.alpha", "0.01"), "unrestricted"), None, "not the paper's fc-maddpg");
+        let mut wide = matched.clone();
+        wide.prior = wide.prior.with("unit", 0.25);
+        assert_eq!(cell(&wide, "dbc-medium"), Some((-98.0, 30.5, "priors")));
+        wide.prior = wide.prior.with("unit", 1);
+        assert_eq!(cell(&wide, "dbc-medium"), None, "another range than the test channel's");
+        let mut resolved = cc.clone();
+        resolved.scenario.params = crate::scenario::build(&cc.scenario).unwrap().parameters();
+        resolved.scenario.params.remove("name");
+        assert!(cell(&resolved, "unrestricted").is_some(), "all defaults, written out");
+        resolved.scenario = resolved.scenario.with("steps", 50);
+        assert_eq!(cell(&resolved, "unrestricted"), None, "longer episodes");
         let mut other_profile = cc;
         other_profile.task.profile = "mpe2".to_owned();
         assert_eq!(cell(&other_profile, "unrestricted"), None);

@@ -29,6 +29,9 @@ const ALGORITHMS: [&str; 9] = [
 /// Fewest seeds that give an interval over seeds.
 const SEEDS_FOR_INTERVAL: usize = 3;
 
+/// Environment steps of the paper's trainings.
+const PUBLISHED_STEPS: u64 = 4_000_000;
+
 /// Returns of the policies that bracket a task; they hear no messages, so channels do not matter to them.
 #[derive(Clone, Debug)]
 pub struct Reference {
@@ -43,6 +46,8 @@ pub struct Reference {
 /// One algorithm under one channel.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cell {
+    /// Seeds with episodes under this channel; fewer than the row's where a run was not evaluated on it.
+    pub seeds: usize,
     /// Test episodes, all seeds.
     pub episodes: usize,
     /// Mean over seeds of the mean over episodes.
@@ -63,6 +68,15 @@ impl Cell {
     /// Half-width of what stands behind the ±: the interval over seeds, else one deviation over episodes.
     pub fn spread(&self) -> f64 {
         self.interval.map_or(self.sd, |i| (i.high - i.low) / 2.0)
+    }
+
+    /// Its number of seeds in brackets, where the row's says another.
+    pub fn seeds_label(&self, row: &Row) -> String {
+        match self.seeds {
+            n if n == row.seeds.len() => String::new(),
+            1 => " (1 seed)".to_owned(),
+            n => format!(" ({n} seeds)"),
+        }
     }
 }
 
@@ -201,12 +215,16 @@ pub(super) fn table(
     channels.sort_by(|a, b| rank(a).cmp(&rank(b)).then(a.cmp(b)));
     let mut rows = Vec::new();
     let mut shown = Vec::new();
+    let mut short: BTreeMap<u64, Vec<String>> = BTreeMap::new();
     for (name, group) in series(&evaluated)? {
         let cells = channels.iter().map(|channel| cell(&group, channel, tables)).collect::<Vec<_>>();
         for (channel, cell) in channels.iter().zip(&cells) {
             if let Some(published) = cell.as_ref().and_then(|c| c.published) {
                 shown.push((group[0].algorithm.clone(), channel.clone(), published));
             }
+        }
+        if group[0].steps < PUBLISHED_STEPS && cells.iter().flatten().any(|c| c.published.is_some()) {
+            short.entry(group[0].steps).or_default().push(name.clone());
         }
         rows.push(Row { series: name, seeds: group.iter().map(|r| r.seed).collect(), cells });
     }
@@ -227,6 +245,10 @@ pub(super) fn table(
              test."
                 .to_owned(),
         );
+    }
+    for (steps, names) in short {
+        let (steps, published) = (thousands(steps), thousands(PUBLISHED_STEPS));
+        notes.push(format!("{}: trained for {steps} steps; the paper for {published}.", names.join(", ")));
     }
     if !references.is_empty() {
         notes.push(
@@ -249,6 +271,7 @@ fn cell(group: &[&Run], channel: &str, tables: &Tables) -> Option<Cell> {
     let losses: Vec<f64> = by_seed.iter().flatten().map(|e| e.loss_rate).collect();
     let enough = means.len() >= SEEDS_FOR_INTERVAL;
     Some(Cell {
+        seeds: means.len(),
         episodes: all.len(),
         mean: mean(&means),
         sd: if all.len() < 2 { 0.0 } else { sd(&all) },
@@ -257,6 +280,13 @@ fn cell(group: &[&Run], channel: &str, tables: &Tables) -> Option<Cell> {
         published: tables.of(group[0], channel),
         best: false,
     })
+}
+
+/// A whole number with a no-break space between thousands.
+fn thousands(number: u64) -> String {
+    let digits = number.to_string();
+    let groups = digits.as_bytes().rchunks(3).rev().map(|g| g.iter().map(|b| char::from(*b)).collect::<String>());
+    groups.collect::<Vec<_>>().join("\u{a0}")
 }
 
 /// Marks, per column, the highest mean and every row whose interval reaches into the best one's; only where all rows
@@ -276,9 +306,10 @@ fn mark_best(rows: &mut [Row], columns: usize) {
 }
 
 fn spread_notes(rows: &[Row]) -> Vec<String> {
-    let few = rows.iter().filter(|r| r.seeds.len() < SEEDS_FOR_INTERVAL).count();
+    let cells = || rows.iter().flat_map(|r| r.cells.iter().flatten());
+    let few = cells().filter(|c| c.interval.is_none()).count();
     let mut notes = Vec::new();
-    if few < rows.len() {
+    if few < cells().count() {
         notes.push("± with three or more seeds: half of the 95 % Student interval for the mean over seeds.".to_owned());
     }
     if few > 0 {
@@ -287,8 +318,16 @@ fn spread_notes(rows: &[Row]) -> Vec<String> {
              how sure the mean is over trainings: not a comparison of algorithms."
                 .to_owned(),
         );
+    }
+    if few > 0 && !cells().any(|c| c.best) {
         notes.push(
             "No value is set in bold: a best algorithm is named only when every row has at least three seeds."
+                .to_owned(),
+        );
+    } else if few > 0 {
+        notes.push(
+            "Bold, only in columns where every row has at least three seeds: the highest mean, and every mean whose \
+             interval reaches into its interval."
                 .to_owned(),
         );
     } else if rows.len() > 1 {
@@ -326,7 +365,7 @@ impl Returns {
             for (channel, cell) in self.channels.iter().zip(&row.cells) {
                 let Some(cell) = cell else { continue };
                 lines.push(Tidy {
-                    seeds: row.seeds.len(),
+                    seeds: cell.seeds,
                     interval_low: cell.interval.map(|i| i.low),
                     interval_high: cell.interval.map(|i| i.high),
                     loss_rate: Some(cell.loss_rate),

@@ -6,7 +6,7 @@ use serde_json::json;
 
 use crate::figure::{self, Bar, Data, FIGURES};
 use crate::io::IoError;
-use crate::io::{create_parent, partial_path, publish, refuse_existing, write_atomic};
+use crate::io::{create_parent, partial_path, publish, read_text, refuse_existing, write_atomic};
 use crate::registry::find;
 use crate::report::collect::{Collected, Task};
 use crate::report::markdown::{Grid, Line, caption, csv, document, escape, grid, table, tidy_csv};
@@ -14,6 +14,9 @@ use crate::report::mutual::{MutualFile, map, number};
 use crate::report::page::{Picture, Section, html};
 use crate::report::returns::{Reference, Returns, Tidy};
 use crate::report::{ReportError, Run, Tables, curves, returns};
+
+/// The file that says that a directory is a report, by its key `ccmarl`.
+const MARKER: &str = "provenance.json";
 
 /// Most lines of estimates on the page; the CSV has all.
 const LINES_ON_PAGE: usize = 200;
@@ -53,20 +56,57 @@ impl Summary {
 
 /// Writes the report's directory.
 ///
+/// With `force`, a directory is replaced only if it is an earlier report and nothing else is in it.
+///
 /// # Errors
-/// [`ReportError`]; nothing stays under `request.out` then.
+/// [`ReportError`]; nothing stays under `request.out` then, but what was there.
 pub fn write(collected: &Collected, request: &Request<'_>) -> Result<Summary, ReportError> {
     refuse_existing(request.out, request.force)?;
+    refuse_foreign(request.out)?;
     create_parent(request.out)?;
     let partial = partial_path(request.out);
     let result = Output::start(&partial).and_then(|output| fill(output, collected, request)).and_then(|summary| {
-        publish(&partial, request.out, request.force, "index.html")?;
+        refuse_foreign(request.out)?;
+        publish(&partial, request.out, request.force, MARKER)?;
         Ok(summary)
     });
     if result.is_err() && partial.is_dir() {
         std::fs::remove_dir_all(&partial).map_err(IoError::os("remove the unfinished", &partial))?;
     }
     result
+}
+
+/// Refuses to replace anything but an earlier report with only its own files, or an empty directory.
+fn refuse_foreign(out: &Path) -> Result<(), IoError> {
+    if out.symlink_metadata().is_err() {
+        return Ok(());
+    }
+    let foreign = || IoError::Foreign(out.to_owned());
+    if !out.is_dir() {
+        return Err(foreign());
+    }
+    let made = |dir: &Path, own: &dyn Fn(&str) -> bool| -> Result<bool, IoError> {
+        for entry in std::fs::read_dir(dir).map_err(IoError::os("list", dir))? {
+            let name = entry.map_err(IoError::os("list", dir))?.file_name();
+            if !own(&name.to_string_lossy()) {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    };
+    if made(out, &|_| false)? {
+        return Ok(()); // empty
+    }
+    let record = read_text(&out.join(MARKER), 64 << 20).ok();
+    let record = record.and_then(|text| serde_json::from_str::<serde_json::Value>(&text).ok());
+    if record.is_none_or(|record| record.get("ccmarl").is_none()) {
+        return Err(foreign());
+    }
+    let ends = |name: &str, endings: [&str; 2]| endings.iter().any(|e| name.ends_with(e));
+    let ours = made(out, &|name| ["index.html", "command.txt", MARKER, "figures", "tables"].contains(&name))?
+        && (!out.join("figures").is_dir() || made(&out.join("figures"), &|name| ends(name, [".svg", ".png"]))?)
+        && (!out.join("tables").is_dir() || made(&out.join("tables"), &|name| ends(name, [".md", ".csv"]))?);
+    if ours { Ok(()) } else { Err(foreign()) }
 }
 
 /// The directory under work.
@@ -164,7 +204,7 @@ fn lead(collected: &Collected, tables: &[Returns]) -> String {
             plural(collected.mutual.len(), "table")
         ));
     }
-    let single = tables.iter().any(|t| t.rows.iter().any(|r| r.seeds.len() < 3));
+    let single = tables.iter().any(|t| t.rows.iter().any(|r| r.cells.iter().flatten().any(|c| c.seeds < 3)));
     let caution =
         if single { " Some rows have fewer than three seeds: read them as examples, not as a comparison." } else { "" };
     format!("{}.{caution}", parts.join(", "))
@@ -247,11 +287,12 @@ fn task_section(
 
 /// What the whiskers are; a comparison is promised only over seeds.
 fn whiskers(returns: &Returns) -> String {
-    let few = returns.rows.iter().filter(|r| r.seeds.len() < 3).count();
-    match (few, returns.rows.iter().all(|r| r.seeds.len() == 1)) {
+    let cells = || returns.rows.iter().flat_map(|r| r.cells.iter().flatten());
+    let few = cells().filter(|c| c.interval.is_none()).count();
+    match (few, cells().all(|c| c.seeds == 1)) {
         (0, _) => "whiskers: 95 % Student interval over seeds".to_owned(),
         (_, true) => "one seed: ± one standard deviation over episodes, not a comparison".to_owned(),
-        (n, _) if n == returns.rows.len() => {
+        (n, _) if n == cells().count() => {
             "fewer than 3 seeds: ± one standard deviation over episodes, not a comparison".to_owned()
         }
         _ => "whiskers: 95 % interval over seeds where there are 3, else ± one deviation over episodes".to_owned(),

@@ -314,11 +314,85 @@ fn the_command_prints_a_summary_refuses_what_exists_and_replaces_only_reports() 
     assert_eq!(forced.status.code(), Some(0), "{}", text(&forced.stderr));
     let json: serde_json::Value = serde_json::from_slice(&forced.stdout).unwrap();
     assert_eq!(json[0]["algorithm"], "dropout-maddpg-0.2");
-    std::fs::remove_file(out.join("index.html")).unwrap();
-    let foreign = run(&["--force"]);
-    assert_eq!(foreign.status.code(), Some(1));
-    assert!(text(&foreign.stderr).contains("did not make"), "{}", text(&foreign.stderr));
-    assert!(out.join("tables").exists(), "what was there is still there");
+    let refused = |why: &str| {
+        let foreign = run(&["--force"]);
+        assert_eq!(foreign.status.code(), Some(1), "{why}");
+        assert!(text(&foreign.stderr).contains("did not make"), "{why}: {}", text(&foreign.stderr));
+        assert!(out.join("tables").exists() && !dir.path().join(".r.partial").exists(), "{why}: as it was");
+    };
+    for (name, why) in [("thesis.tex", "beside the page"), ("runs/a", "runs"), ("figures/a.tex", "beside the figures")]
+    {
+        io_write(&out.join(name), "mine");
+        refused(why);
+        assert_eq!(read(out.join(name)), "mine");
+        std::fs::remove_file(out.join(name)).unwrap();
+    }
+    std::fs::remove_dir(out.join("runs")).unwrap();
+    let provenance = read(out.join("provenance.json"));
+    io_write(&out.join("provenance.json"), "{}");
+    refused("another program's provenance");
+    std::fs::remove_file(out.join("provenance.json")).unwrap();
+    refused("any directory with an index.html");
+    io_write(&out.join("provenance.json"), &provenance);
+    assert_eq!(run(&["--force"]).status.code(), Some(0), "a report and nothing else");
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "nothing is left beside it");
     let nothing = assert_cmd::Command::cargo_bin("ccmarl").unwrap().args(["report", "--out", "x"]).output().unwrap();
     assert_eq!((nothing.status.code(), Path::new("x").exists()), (Some(2), false));
+}
+
+#[test]
+fn a_damaged_table_is_an_error_and_never_a_panic() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = dir.path().join("x");
+    make_run(&run, "fc-maddpg", "name = \"perfect\"", 1, -100.0);
+    estimates(&run.join("mi.parquet"));
+    for name in ["evaluation.parquet", "metrics.parquet", "mi.parquet"] {
+        let path = run.join(name);
+        let bytes = std::fs::read(&path).unwrap();
+        let footer = u32::from_le_bytes(bytes[bytes.len() - 8..bytes.len() - 4].try_into().unwrap()) as usize;
+        let footer = bytes.len() - 8 - footer;
+        for at in (0..footer).step_by(29).chain((footer..bytes.len()).step_by(5)) {
+            let mut changed = bytes.clone();
+            changed[at] ^= 0x55;
+            ccmarl::io::write_atomic(&path, &changed).unwrap();
+            // some flips change a value or a statistic that nobody checks; whatever comes back, it comes back
+            drop(collect(std::slice::from_ref(&run), &[]));
+        }
+        ccmarl::io::write_atomic(&path, &bytes).unwrap();
+    }
+    collect(&[run], &[]).unwrap();
+}
+
+#[test]
+fn a_channel_of_fewer_seeds_says_so_in_its_cell() {
+    let dir = tempfile::tempdir().unwrap();
+    for seed in 1..=3 {
+        make_run(&dir.path().join(format!("runs/{seed}")), "fc-maddpg", "name = \"perfect\"", seed, -100.0);
+    }
+    let path = dir.path().join("runs/3/evaluation.parquet");
+    let frame = ParquetReader::new(std::fs::File::open(&path).unwrap()).finish().unwrap();
+    parquet(&path, frame.head(Some(28)).columns().to_vec()); // seven channels of four episodes: none was not tested
+    let summary = report(&[dir.path().join("runs")], &[], &dir.path().join("r")).unwrap();
+    let cells: Vec<_> = summary.tables[0].rows[0].cells.iter().flatten().collect();
+    assert_eq!(cells.iter().map(|c| c.seeds).collect::<Vec<_>>(), [3, 3, 3, 3, 3, 3, 3, 2]);
+    assert!(cells[6].interval.is_some() && cells[7].interval.is_none());
+    assert_eq!((summary.tidy()[0].seeds, summary.tidy()[7].seeds), (3, 2));
+    let text = read(dir.path().join("r/tables/simple_spread-3-paper-returns.md"));
+    assert_eq!(text.matches(" (2 seeds) |").count(), 1, "{text}");
+    assert!(text.contains("three or more seeds") && text.contains("fewer than three seeds"), "{text}");
+    assert!(text.contains("- fc-maddpg: trained for 1\u{a0}200 steps; the paper for 4\u{a0}000\u{a0}000."), "{text}");
+}
+
+#[test]
+fn a_foreign_run_cannot_steer_the_terminal() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = dir.path().join("x");
+    make_run(&run, "fc-maddpg", "name = \"perfect\"", 1, -100.0);
+    let config = read(run.join("config.toml"));
+    io_write(&run.join("config.toml"), &config.replace("\"paper\"", "\"\\u001b[31mred\""));
+    let mut command = assert_cmd::Command::cargo_bin("ccmarl").unwrap();
+    let done = command.arg("report").arg(&run).arg("--out").arg(dir.path().join("r")).output().unwrap();
+    let (out, err) = (String::from_utf8(done.stdout).unwrap(), String::from_utf8(done.stderr).unwrap());
+    assert!(err.contains("no reference rows for") && err.contains("[31mred"), "{err}");
+    assert!(!err.contains('\u{1b}') && !out.contains('\u{1b}'), "{err}{out}");
 }
