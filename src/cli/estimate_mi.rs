@@ -23,7 +23,14 @@ Examples:
   ccmarl estimate-mi table.csv --x a --y b --time t --out result.json
 
 For a store: x is the message that the sender sent, y the action of the receiver at the same step, per ordered link,
-delivered and lost apart. Values are in nats unless the unit says jsd. p: episodes permuted.";
+delivered and lost apart. Values are in nats unless the unit says jsd. p: episodes permuted.
+In a CSV an empty cell and NaN are missing. The rows mean:
+  jsd            2·JSD of the critic, 0 to 2 ln 2: a lower bound on its own scale, not nats
+  jsd-plugin     the same critic's estimate of the information, nats
+  jsd-nwj, -dv   lower bounds by the same critic, nats; jsd-certified: what the JSD alone proves
+  club           upper bound, nats, often several times the truth; club-l1out: a tighter one
+  club-fit       how much better club's density fits than the margin; near 0 it bounds nothing
+  gaussian       exact for normal data, bias-corrected, nats";
 
 /// Arguments of `ccmarl estimate-mi`.
 #[derive(Debug, clap::Args)]

@@ -25,7 +25,7 @@ pub(super) struct ReportArgs {
     /// Directory to write: index.html, figures/, tables/
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// More tables of estimates, as `estimate-mi` writes them (those inside runs are found)
+    /// More estimates, as `estimate-mi --out x.parquet` writes them (those inside runs are found)
     #[arg(long, value_name = "FILE", num_args = 1..)]
     mi: Vec<PathBuf>,
     /// Title of the page

@@ -121,7 +121,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
                 ("steps", report.steps.to_string()),
                 ("updates", report.updates.to_string()),
                 ("training return", number(report.return_mean)),
-                ("next critic loss", number(report.next_critic_loss)),
+                ("loss of next batch", number(report.next_critic_loss)),
             ];
             ui::print_table(&["trained", ""], &rows.map(|(k, v)| vec![k.to_owned(), v]))?;
         }
