@@ -154,8 +154,7 @@ pub struct Networks {
 #[derive(Debug, Default)]
 struct Scratch {
     joint: Vec<f32>,
-    inputs: Vec<Vec<f32>>,
-    actor_tapes: Vec<Tape>,
+    team: Team,
     critic_tape: Tape,
     grad_q: Vec<f32>,
     grad_joint: Vec<f32>,
@@ -200,41 +199,15 @@ impl Maddpg {
     /// # Errors
     /// [`NnError`] when candle refuses.
     pub fn update(&mut self, batch: &Batch, bonus: &[f32]) -> Result<UpdateMetrics, NnError> {
-        let rows = batch.rows;
-        let widths = Widths::of(&self.actors);
-        self.scratch.actor_tapes.resize_with(self.actors.len(), Tape::default);
-        self.scratch.inputs.resize_with(self.actors.len(), Vec::new);
+        let (rows, widths) = (batch.rows, Widths::of(&self.actors));
 
-        // 1. target: y = r + bonus + γ Q⁻(o', π⁻(o', M'))
-        let Scratch { joint, inputs, actor_tapes, critic_tape, grad_q, target, critic_grads, .. } = &mut self.scratch;
-        let target_actors = self.params.target_actors.read();
-        joint_rows(joint, &batch.next_observations, rows, widths);
-        for i in 0..self.actors.len() {
-            actor_inputs(&self.actors, i, &batch.next_observations, &batch.next_link, rows, &mut inputs[i]);
-            let actions = self.actors.act(&target_actors, i, &inputs[i], rows, &mut actor_tapes[i]);
-            put_actions(
-                joint,
-                actions,
-                widths,
-                self.actors.networks[i].outputs(),
-                widths.action_offset(&self.actors, i),
-            );
+        // 1. and 2. target and critic
+        let [td_loss, q_mean] = self.td_errors(batch, bonus);
+        let Scratch { joint, critic_tape, grad_q, critic_grads, .. } = &mut self.scratch;
+        for error in grad_q.iter_mut() {
+            *error *= 2.0 / rows as f32;
         }
-        let next_q = self.critic.forward(&self.params.target_critic.read(), joint, rows, critic_tape);
-        target.clear();
-        target.extend(batch.reward.iter().zip(next_q).map(|(r, q)| r + self.config.gamma * q));
-        target.iter_mut().zip(bonus).for_each(|(y, b)| *y += b);
-        drop(target_actors);
-
-        // 2. critic
-        joint_rows(joint, &batch.observations, rows, widths);
-        put_actions(joint, &batch.actions, widths, widths.actions, widths.observations);
         let critic_params = self.params.critic.read();
-        let q = self.critic.forward(&critic_params, joint, rows, critic_tape);
-        let q_mean = mean(q);
-        grad_q.clear();
-        grad_q.extend(q.iter().zip(target.iter()).map(|(q, y)| 2.0 * (q - y) / rows as f32));
-        let td_loss = grad_q.iter().map(|&g| (f64::from(g) * rows as f64 / 2.0).powi(2)).sum::<f64>() / rows as f64;
         critic_grads.clear();
         critic_grads.resize(critic_params.len(), 0.0);
         self.critic.backward(&critic_params, joint, critic_tape, grad_q, critic_grads, None);
@@ -260,51 +233,40 @@ impl Maddpg {
         })
     }
 
-    /// The mean squared TD error that [`Maddpg::update`] would report for this minibatch, without changing anything.
-    ///
-    /// # Errors
-    /// [`NnError`] when candle refuses.
-    pub fn td_loss(&mut self, batch: &Batch) -> Result<f64, NnError> {
-        let widths = Widths::of(&self.actors);
-        let (mut joint, mut input) = (Vec::new(), Vec::new());
-        joint_rows(&mut joint, &batch.next_observations, batch.rows, widths);
-        let mut tape = Tape::default();
-        for i in 0..self.actors.len() {
-            actor_inputs(&self.actors, i, &batch.next_observations, &batch.next_link, batch.rows, &mut input);
-            let actions = self.actors.act(&self.params.target_actors.read(), i, &input, batch.rows, &mut tape);
-            put_actions(
-                &mut joint,
-                actions,
-                widths,
-                self.actors.networks[i].outputs(),
-                widths.action_offset(&self.actors, i),
-            );
-        }
-        let next_q = self.critic.forward(&self.params.target_critic.read(), &joint, batch.rows, &mut tape);
-        let target: Vec<f32> = batch.reward.iter().zip(next_q).map(|(r, q)| r + self.config.gamma * q).collect();
-        joint_rows(&mut joint, &batch.observations, batch.rows, widths);
-        put_actions(&mut joint, &batch.actions, widths, widths.actions, widths.observations);
-        let q = self.critic.forward(&self.params.critic.read(), &joint, batch.rows, &mut tape);
-        Ok(q.iter().zip(&target).map(|(q, y)| f64::from(q - y).powi(2)).sum::<f64>() / batch.rows as f64)
+    /// The mean squared TD error that [`Maddpg::update`] would report for this minibatch and no bonus; learns nothing.
+    pub fn td_loss(&mut self, batch: &Batch) -> f64 {
+        self.td_errors(batch, &[])[0]
+    }
+
+    /// Q(o, a) − y per row into `scratch.grad_q`, the critic's input and tape left as a backward pass needs them.
+    /// Returns the mean squared error and the mean Q.
+    fn td_errors(&mut self, batch: &Batch, bonus: &[f32]) -> [f64; 2] {
+        let (rows, widths) = (batch.rows, Widths::of(&self.actors));
+        let Scratch { joint, team, critic_tape, grad_q, target, .. } = &mut self.scratch;
+        // y = r + bonus + γ Q⁻(o', π⁻(o', M'))
+        joint_rows(joint, &batch.next_observations, rows, widths);
+        let (observations, link) = (&batch.next_observations, &batch.next_link);
+        team.act(&self.actors, &self.params.target_actors.read(), (observations, link), rows, joint);
+        let next_q = self.critic.forward(&self.params.target_critic.read(), joint, rows, critic_tape);
+        target.clear();
+        target.extend(batch.reward.iter().zip(next_q).map(|(r, q)| r + self.config.gamma * q));
+        target.iter_mut().zip(bonus).for_each(|(y, b)| *y += b);
+
+        joint_rows(joint, &batch.observations, rows, widths);
+        put_actions(joint, &batch.actions, widths, widths.actions, widths.observations);
+        let q = self.critic.forward(&self.params.critic.read(), joint, rows, critic_tape);
+        grad_q.clear();
+        grad_q.extend(q.iter().zip(target.iter()).map(|(q, y)| q - y));
+        let squares: f64 = grad_q.iter().map(|&error| f64::from(error) * f64::from(error)).sum();
+        [squares / rows as f64, mean(q)]
     }
 
     /// One joint Adam step of all actors; returns mean Q(o, π(o, M)) and the largest gradient norm.
     fn actor_step(&mut self, batch: &Batch, widths: Widths) -> Result<(f64, f32), NnError> {
         let rows = batch.rows;
-        let Scratch { joint, inputs, actor_tapes, critic_tape, grad_q, grad_joint, grad_action, actor_grads, .. } =
-            &mut self.scratch;
+        let Scratch { joint, team, critic_tape, grad_q, grad_joint, grad_action, actor_grads, .. } = &mut self.scratch;
         let actor_params = self.params.actors.read();
-        for i in 0..self.actors.len() {
-            actor_inputs(&self.actors, i, &batch.observations, &batch.link, rows, &mut inputs[i]);
-            let actions = self.actors.act(&actor_params, i, &inputs[i], rows, &mut actor_tapes[i]);
-            put_actions(
-                joint,
-                actions,
-                widths,
-                self.actors.networks[i].outputs(),
-                widths.action_offset(&self.actors, i),
-            );
-        }
+        team.act(&self.actors, &actor_params, (&batch.observations, &batch.link), rows, joint);
         let critic_params = self.params.critic.read();
         let objective = mean(self.critic.forward(&critic_params, joint, rows, critic_tape));
         grad_q.clear();
@@ -320,19 +282,46 @@ impl Maddpg {
             let width = self.actors.networks[i].outputs();
             let at = widths.action_offset(&self.actors, i);
             grad_action.clear();
-            for (grad, row) in grad_joint.chunks_exact(widths.joint()).zip(actor_tapes[i].output().chunks_exact(width))
-            {
+            for (grad, row) in grad_joint.chunks_exact(widths.joint()).zip(team.tapes[i].output().chunks_exact(width)) {
                 grad_action.extend(grad[at..at + width].iter().zip(row).map(|(g, a)| g + penalty * a));
             }
             let grads = &mut actor_grads[self.actors.offsets[i]..self.actors.offsets[i + 1]];
             let params = self.actors.slice(&actor_params, i);
-            self.actors.networks[i].backward(params, &inputs[i], &mut actor_tapes[i], grad_action, grads, None);
+            self.actors.networks[i].backward(params, &team.inputs[i], &mut team.tapes[i], grad_action, grads, None);
             norm = norm.max(clip_norm(grads, self.config.grad_clip));
         }
         drop(actor_params);
         let adam = &mut self.actor_adam;
         self.params.actors.update(|p| adam.step(p, actor_grads))?;
         Ok((objective, norm))
+    }
+}
+
+/// Buffers in which a team acts on a whole batch: each actor's inputs and tape stay for a backward pass.
+#[derive(Debug, Default)]
+struct Team {
+    inputs: Vec<Vec<f32>>,
+    tapes: Vec<Tape>,
+}
+
+impl Team {
+    /// Lays the actions of all actors on `[rows, O]` observations under `[rows, N²]` link bits into the critic's input.
+    fn act(
+        &mut self,
+        actors: &Actors,
+        params: &[f32],
+        (observations, link): (&[f32], &[bool]),
+        rows: usize,
+        joint: &mut [f32],
+    ) {
+        let widths = Widths::of(actors);
+        self.inputs.resize_with(actors.len(), Vec::new);
+        self.tapes.resize_with(actors.len(), Tape::default);
+        for (i, (input, tape)) in self.inputs.iter_mut().zip(self.tapes.iter_mut()).enumerate() {
+            actor_inputs(actors, i, observations, link, rows, input);
+            let actions = actors.act(params, i, input, rows, tape);
+            put_actions(joint, actions, widths, actors.networks[i].outputs(), widths.action_offset(actors, i));
+        }
     }
 }
 
@@ -430,7 +419,7 @@ mod tests {
         let config = MaddpgConfig { actor_learning_rate: 1e-3, tau: 0.0, ..MaddpgConfig::default() };
         let mut learner = Maddpg::new(&agents.iter().collect::<Vec<_>>(), config, &Seeds::new(1)).unwrap();
         let batch = batch(256);
-        let before = learner.td_loss(&batch).unwrap();
+        let before = learner.td_loss(&batch);
         let first = learner.update(&batch, &[]).unwrap();
         assert!((first.td_loss - before).abs() < 1e-9);
         for _ in 0..200 {
@@ -472,8 +461,6 @@ mod tests {
             }
             mean(learner.critic.forward(&learner.params.critic.read(), &joint, 32, &mut tape))
         };
-        learner.scratch.actor_tapes.resize_with(2, Tape::default);
-        learner.scratch.inputs.resize_with(2, Vec::new);
         joint_rows(&mut learner.scratch.joint, &batch.observations, 32, widths);
         let start = learner.params.actors.read().to_vec();
         learner.actor_step(&batch, widths).unwrap();

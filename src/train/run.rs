@@ -218,15 +218,12 @@ impl Trainer {
     }
 
     /// Critic loss of the minibatch that the next update will draw, on the raw reward; nothing changes.
-    ///
-    /// # Errors
-    /// [`TrainError::Nn`].
-    pub fn next_critic_loss(&mut self) -> Result<Option<f64>, TrainError> {
+    pub fn next_critic_loss(&mut self) -> Option<f64> {
         if self.replay.is_empty() {
-            return Ok(None);
+            return None;
         }
         self.draw(self.update);
-        Ok(Some(self.learner.td_loss(&self.batch)?))
+        Some(self.learner.td_loss(&self.batch))
     }
 
     /// One update of estimators, critic and actors.
@@ -385,7 +382,7 @@ pub fn train(
         updates: trainer.update,
         episodes: trainer.episode,
         return_mean: trainer.return_mean(),
-        next_critic_loss: trainer.next_critic_loss()?,
+        next_critic_loss: trainer.next_critic_loss(),
         interrupted: trainer.step < trainer.config.steps,
     })
 }
