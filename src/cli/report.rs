@@ -13,7 +13,7 @@ use crate::report::{Collected, Reference, Request, Summary, collect, write};
 use crate::scenario;
 
 /// Episodes of each reference policy, and their seed: the same rows in every report.
-const REFERENCE_EPISODES: u64 = 400;
+const REFERENCE_EPISODES: u64 = 2_000;
 const REFERENCE_SEED: u64 = 1;
 
 /// Tables, figures and one self-contained page from run directories.
