@@ -1,6 +1,6 @@
 //! Reports: run directories in; tables, figures and one self-contained page out.
 //!
-//! [`collect`] reads runs and MI files, [`write`] makes the output directory. Between the two the caller may compute
+//! [`collect()`] reads runs and MI files, [`write()`] makes the output directory. Between the two the caller may compute
 //! reference returns (random policy, oracle) for [`Collected::tasks`].
 
 mod collect;
