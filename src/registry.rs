@@ -179,6 +179,16 @@ impl<'de> Deserialize<'de> for Spec {
     }
 }
 
+/// Parameters as a manifest records them: the name, then every field.
+pub fn resolved(name: &str, parameters: &impl Serialize) -> Map<String, Value> {
+    let mut map = Map::new();
+    map.insert("name".to_owned(), Value::from(name));
+    if let Ok(Value::Object(fields)) = serde_json::to_value(parameters) {
+        map.extend(fields);
+    }
+    map
+}
+
 /// The entry called `name`.
 ///
 /// # Errors

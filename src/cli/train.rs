@@ -18,6 +18,7 @@ Examples:
   ccmarl train --config run.toml --out runs/y
   ccmarl train --out runs/x --resume
 
+Without --scenario and --config it is simple_spread with 3 agents.
 The run directory holds config.toml (fully resolved), metrics.parquet, TensorBoard events and checkpoint/, saved every
 2000 updates and at the end. Ctrl-C saves and exits 4; --resume reads the run's own config.toml and goes on from its last
 checkpoint, to the same bytes as a run that was never stopped.";

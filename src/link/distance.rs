@@ -61,7 +61,7 @@ fn build(spec: &Spec, setting: &Setting) -> Result<Box<dyn Link>, RegistryError>
 
 impl Link for Distance {
     fn parameters(&self) -> Map<String, Value> {
-        super::resolved(ENTRY.name, self)
+        crate::registry::resolved(ENTRY.name, self)
     }
 
     fn start(&self, _n: usize, _seeds: &Seeds) -> Box<dyn LinkEpisode> {

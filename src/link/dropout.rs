@@ -49,7 +49,7 @@ fn build(spec: &Spec, _setting: &super::Setting) -> Result<Box<dyn Link>, Regist
 
 impl Link for Dropout {
     fn parameters(&self) -> Map<String, Value> {
-        super::resolved(ENTRY.name, self)
+        crate::registry::resolved(ENTRY.name, self)
     }
 
     fn start(&self, n: usize, seeds: &Seeds) -> Box<dyn LinkEpisode> {

@@ -119,7 +119,7 @@ fn build(spec: &Spec, _setting: &super::Setting) -> Result<Box<dyn Link>, Regist
 
 impl Link for Markov {
     fn parameters(&self) -> Map<String, Value> {
-        let mut map = super::resolved(ENTRY.name, &self.params);
+        let mut map = crate::registry::resolved(ENTRY.name, &self.params);
         if self.params.level.is_none() {
             map.shift_remove("level");
         }

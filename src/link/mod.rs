@@ -11,7 +11,6 @@ mod none;
 mod perfect;
 mod suite;
 
-use serde::Serialize;
 use serde_json::{Map, Value};
 
 pub use suite::{Channel, SUITES, channel, suite};
@@ -77,16 +76,6 @@ fn streams(n: usize, seeds: &Seeds) -> Vec<Stream> {
         streams.extend((0..n).filter(|&r| r != s).map(|r| sender.indexed_stream("receiver", r as u64)));
     }
     streams
-}
-
-/// Parameters as the manifest records them: the name, then every field.
-fn resolved(name: &str, parameters: &impl Serialize) -> Map<String, Value> {
-    let mut map = Map::new();
-    map.insert("name".to_owned(), Value::from(name));
-    if let Ok(Value::Object(fields)) = serde_json::to_value(parameters) {
-        map.extend(fields);
-    }
-    map
 }
 
 /// The bits of `rows` rows of one episode of a link, for tests.

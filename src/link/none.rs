@@ -45,7 +45,7 @@ struct Diagonal {
 
 impl Link for Silent {
     fn parameters(&self) -> Map<String, Value> {
-        super::resolved(ENTRY.name, self)
+        crate::registry::resolved(ENTRY.name, self)
     }
 
     fn start(&self, n: usize, _seeds: &Seeds) -> Box<dyn LinkEpisode> {

@@ -41,7 +41,7 @@ struct Perfect {}
 
 impl Link for Perfect {
     fn parameters(&self) -> Map<String, Value> {
-        super::resolved(ENTRY.name, self)
+        crate::registry::resolved(ENTRY.name, self)
     }
 
     fn start(&self, _n: usize, _seeds: &Seeds) -> Box<dyn LinkEpisode> {

@@ -91,8 +91,8 @@ pub enum PairsError {
         /// File.
         path: PathBuf,
     },
-    /// An infinite number.
-    #[error("column {name:?}, row {row}: infinite; remove the row or the column: {}", path.display())]
+    /// A number whose square is infinite.
+    #[error("column {name:?}, row {row}: infinite or over 1e150; remove the row or rescale the column: {}", path.display())]
     Infinite {
         /// Column.
         name: String,

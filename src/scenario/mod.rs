@@ -8,7 +8,6 @@ mod simple_spread;
 mod simple_tag;
 mod world;
 
-use serde::Serialize;
 use serde_json::{Map, Value};
 
 pub use decoder::Decoder;
@@ -117,16 +116,6 @@ fn check_common(spec: &Spec, profile: &str, agents: usize, steps: usize, laws: &
     spec.in_range("damping", laws.damping, 0.0, 1.0)?;
     spec.in_range("contact_force", laws.contact_force, 0.0, 1e4)?;
     spec.in_range("contact_margin", laws.contact_margin, 1e-9, 1.0)
-}
-
-/// Parameters as the manifest records them: the name, then every field.
-fn resolved(name: &str, parameters: &impl Serialize) -> Map<String, Value> {
-    let mut map = Map::new();
-    map.insert("name".to_owned(), Value::from(name));
-    if let Ok(Value::Object(fields)) = serde_json::to_value(parameters) {
-        map.extend(fields);
-    }
-    map
 }
 
 /// `x y vx vy` of the agents, then `x y` of `landmarks` landmarks.

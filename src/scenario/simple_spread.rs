@@ -164,7 +164,7 @@ fn build(spec: &Spec) -> Result<Box<dyn Scenario>, RegistryError> {
 
 impl Scenario for SimpleSpread {
     fn parameters(&self) -> Map<String, Value> {
-        super::resolved(ENTRY.name, &self.params)
+        crate::registry::resolved(ENTRY.name, &self.params)
     }
 
     fn agents(&self) -> &[AgentSpec] {

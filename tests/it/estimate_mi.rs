@@ -45,6 +45,7 @@ fn errors_name_the_remedy_and_have_the_right_exit_code() {
     let dir = tempfile::tempdir().unwrap();
     let table = csv(dir.path());
     let infinite = write(dir.path(), "inf.csv", "a,b\n1,2\n2,inf\n");
+    let huge = write(dir.path(), "huge.csv", "a,b\n1,2\n2,3\n3,1e308\n");
     let hollow = write(dir.path(), "hollow.csv", "a,b\n1,\n,2\n");
     let empty = write(dir.path(), "empty.csv", "");
     let broken = write(dir.path(), "broken.parquet", "PAR1 and then nothing of the kind");
@@ -80,7 +81,8 @@ fn errors_name_the_remedy_and_have_the_right_exit_code() {
             &[&table, "--x", "a", "--y", "b", "--group", "c", "--estimator", "jsd"],
             "needs at least 10 episodes to split by episode",
         ),
-        (1, &[&infinite, "--x", "a", "--y", "b"], "column \"b\", row 2: infinite"),
+        (1, &[&infinite, "--x", "a", "--y", "b"], "column \"b\", row 2: infinite or over 1e150"),
+        (1, &[&huge, "--x", "a", "--y", "b"], "column \"b\", row 3: infinite or over 1e150"),
         (1, &[&hollow, "--x", "a", "--y", "b"], "no rows: all 2 rows have a missing value in a, b"),
         (1, &[&empty, "--x", "a", "--y", "b"], "not a readable CSV table"),
         (1, &[&broken, "--x", "a", "--y", "b"], "not a readable Parquet table"),
