@@ -125,6 +125,17 @@ impl Spec {
         })
     }
 
+    /// Checks that no parameter was given, for plugins that take none.
+    ///
+    /// # Errors
+    /// [`RegistryError::Params`] that names the one given.
+    pub fn no_params(&self) -> Result<(), RegistryError> {
+        #[derive(Deserialize)]
+        #[serde(deny_unknown_fields)]
+        struct NoParams {}
+        self.params().map(|NoParams {}| ())
+    }
+
     /// Checks that the parameter `key` lies in `[low, high]`.
     ///
     /// # Errors

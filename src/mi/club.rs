@@ -56,12 +56,9 @@ const OTHERS: usize = 512;
 
 struct Club;
 
-#[derive(Debug, serde::Deserialize)]
-#[serde(deny_unknown_fields)]
-struct NoParams {}
-
 fn build(spec: &Spec) -> Result<Box<dyn Estimator>, RegistryError> {
-    spec.params::<NoParams>().map(|NoParams {}| Box::new(Club) as Box<dyn Estimator>)
+    spec.no_params()?;
+    Ok(Box::new(Club))
 }
 
 /// q under training, and its buffers.

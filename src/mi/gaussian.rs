@@ -55,12 +55,9 @@ const GROUPS: usize = 50;
 
 struct Gaussian;
 
-#[derive(Debug, serde::Deserialize)]
-#[serde(deny_unknown_fields)]
-struct NoParams {}
-
 fn build(spec: &Spec) -> Result<Box<dyn Estimator>, RegistryError> {
-    spec.params::<NoParams>().map(|NoParams {}| Box::new(Gaussian) as Box<dyn Estimator>)
+    spec.no_params()?;
+    Ok(Box::new(Gaussian))
 }
 
 impl Estimator for Gaussian {

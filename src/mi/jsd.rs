@@ -64,12 +64,9 @@ const NEGATIVES: usize = 16;
 
 struct Jsd;
 
-#[derive(Debug, serde::Deserialize)]
-#[serde(deny_unknown_fields)]
-struct NoParams {}
-
 fn build(spec: &Spec) -> Result<Box<dyn Estimator>, RegistryError> {
-    spec.params::<NoParams>().map(|NoParams {}| Box::new(Jsd) as Box<dyn Estimator>)
+    spec.no_params()?;
+    Ok(Box::new(Jsd))
 }
 
 /// The critic under training, and its buffers.

@@ -19,7 +19,6 @@
 //! # Differences from the reference implementation
 //! None.
 
-use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use super::{Build, Policy, PolicyEpisode, View};
@@ -34,15 +33,10 @@ pub(super) const ENTRY: Entry<Build> = Entry {
     reference: "common practice",
     value: None,
     build: |spec, _| {
-        spec.params::<NoParams>()?;
+        spec.no_params()?;
         Ok(Box::new(Random))
     },
 };
-
-/// Takes no parameters, and says so to who gives some.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct NoParams {}
 
 struct Random;
 

@@ -21,7 +21,6 @@
 
 use serde_json::{Map, Value};
 
-use super::random::NoParams;
 use super::{Build, Policy, PolicyEpisode, View};
 use crate::registry::Entry;
 use crate::rng::Seeds;
@@ -34,7 +33,7 @@ pub(super) const ENTRY: Entry<Build> = Entry {
     reference: "this program",
     value: None,
     build: |spec, _| {
-        spec.params::<NoParams>()?;
+        spec.no_params()?;
         Ok(Box::new(Scripted))
     },
 };

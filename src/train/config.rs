@@ -199,17 +199,18 @@ impl TrainConfig {
         env!("CARGO_PKG_VERSION").clone_into(&mut self.ccmarl);
         let parameters = crate::scenario::build(&self.scenario)?.parameters();
         self.scenario = resolved(parameters.clone());
-        let again = crate::scenario::build(&self.scenario)?.parameters();
+        let scenario = crate::scenario::build(&self.scenario)?;
+        let again = scenario.parameters();
         if let Some((key, _)) = parameters.iter().find(|(key, value)| again.get(*key) != Some(*value)) {
             let message = "null cannot be written in TOML; give a number (a radius of 1000 sees everything)".to_owned();
             return Err(TrainError::Value { name: format!("scenario.{key}"), message });
         }
         let prior = self.prior.take().unwrap_or(preset.prior);
-        let setting = crate::link::Setting { distance_unit: crate::scenario::build(&self.scenario)?.link_unit() };
+        let setting = crate::link::Setting { distance_unit: scenario.link_unit() };
         self.prior = Some(resolved(crate::link::build(&prior, &setting)?.parameters()));
         let tag = self.scenario.name == "simple_tag";
         let [alpha, beta] = if preset.shaped { [0.01, if tag { 0.001 } else { 0.01 }] } else { [0.0, 0.0] };
-        let learners = crate::scenario::build(&self.scenario)?.agents().iter().filter(|a| a.learner).count();
+        let learners = scenario.agents().iter().filter(|a| a.learner).count();
         self.maddpg.batch.get_or_insert(if tag && learners >= 6 { 512 } else { MaddpgConfig::BATCH });
         self.dumie.alpha.get_or_insert(alpha);
         self.dumie.beta.get_or_insert(beta);

@@ -1,7 +1,6 @@
 //! Reading one Parquet file: row batches of bounded size, put together to whole episodes.
 
 use std::fs::File;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 
 use arrow::array::{
@@ -200,10 +199,10 @@ fn elements<A: Array + 'static>(array: &ArrayRef) -> Result<(&A, usize), String>
 /// Runs a call into the decoder. It reports most faults as errors, but a file made to harm can make it panic; that
 /// becomes an error as well.
 fn guard<T, E: std::fmt::Display>(path: &Path, call: impl FnOnce() -> Result<T, E>) -> Result<T, StorageError> {
-    match catch_unwind(AssertUnwindSafe(call)) {
-        Ok(Ok(value)) => Ok(value),
-        Ok(Err(error)) => Err(damaged(path, format!("cannot be decoded: {error}"))),
-        Err(_) => Err(damaged(path, "the Parquet decoder gave up on it".to_owned())),
+    match crate::io::caught(call) {
+        Some(Ok(value)) => Ok(value),
+        Some(Err(error)) => Err(damaged(path, format!("cannot be decoded: {error}"))),
+        None => Err(damaged(path, "the Parquet decoder gave up on it".to_owned())),
     }
 }
 
