@@ -152,9 +152,9 @@ impl Player {
                 actions.extend_from_slice(taken);
             }
             let mut next = recorded.to_vec();
-            let reward = scenario.step(&mut next, &actions, &mut rewards, &mut self.scratch);
+            scenario.step(&mut next, &actions, &mut rewards, &mut self.scratch);
             self.state.compare(e.index, step + 1, &e.state[(step + 1) * width..(step + 2) * width], &next);
-            self.reward.compare(e.index, step, &e.reward[step..=step], &[reward]);
+            self.reward.compare(e.index, step, &e.reward[step..=step], &[scenario.team_reward(&rewards)]);
             for (a, column) in self.rewards.iter_mut().enumerate() {
                 column.compare(e.index, step, &e.rewards[a][step..=step], &rewards[a..=a]);
             }

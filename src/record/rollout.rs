@@ -114,9 +114,9 @@ impl Recording<'_> {
             let view = View { state: &state, observations: &observations, messages: &messages, link: &link };
             policy.act(&view, &mut actions);
             scenario.scripted(&state, &mut rule, &mut actions);
-            let reward = scenario.step(&mut state, &actions, &mut rewards, &mut scratch);
+            scenario.step(&mut state, &actions, &mut rewards, &mut scratch);
             append(&mut episode.actions, &actions);
-            episode.reward.push(reward);
+            episode.reward.push(scenario.team_reward(&rewards));
             episode.rewards.iter_mut().zip(&rewards).for_each(|(column, &r)| column.push(r));
         }
         episode.steps = steps;

@@ -50,6 +50,17 @@ pub struct Base {
     pub physics: Physics,
     /// Steps in an episode (time limit).
     pub steps: usize,
+    /// What of the agents' rewards a trainer optimises.
+    pub team: Team,
+}
+
+/// What a team earns, from what its agents earn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Team {
+    /// The first agent's reward (which all share, or which all are to maximise).
+    First,
+    /// The sum over all agents.
+    Sum,
 }
 
 /// A task: who is there, how the world starts, what agents see, what they earn.
@@ -79,8 +90,15 @@ pub trait Scenario: Send + Sync {
     fn oracle(&self, state: &[f64], actions: &mut [f32]);
 
     /// Moves the world by one step of `dt` under all agents' actions and writes each agent's reward.
-    /// Returns the team reward that a trainer optimises.
-    fn step(&self, state: &mut [f64], actions: &[f32], rewards: &mut [f32], scratch: &mut Scratch) -> f32;
+    fn step(&self, state: &mut [f64], actions: &[f32], rewards: &mut [f32], scratch: &mut Scratch);
+
+    /// The team reward of a step, which a trainer optimises, from the agents' rewards.
+    fn team_reward(&self, rewards: &[f32]) -> f32 {
+        match self.base().team {
+            Team::First => rewards[0],
+            Team::Sum => rewards.iter().map(|&r| f64::from(r)).sum::<f64>() as f32,
+        }
+    }
 
     /// World units in one unit of `distance` links by default (design §6).
     fn link_unit(&self) -> f64 {

@@ -30,7 +30,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::params::{Common, MAX_AGENTS, Maybe, Profile, read};
-use super::{Base, Body, Build, Physics, Scenario, Scratch, Writer};
+use super::{Base, Body, Build, Physics, Scenario, Scratch, Team, Writer};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::{Stream, below};
 
@@ -56,7 +56,7 @@ enum Loss {
 /// What the team earns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-enum Team {
+enum TeamReward {
     /// What the adversary earns.
     Adversary,
     /// The sum over all agents.
@@ -82,7 +82,7 @@ struct Params {
     /// What the adversary loses.
     adversary_loss: Loss,
     /// What the team earns.
-    team_reward: Team,
+    team_reward: TeamReward,
 }
 
 impl Params {
@@ -96,7 +96,7 @@ impl Params {
             landmark_size: 0.08,
             collide: false,
             adversary_loss: if paper { Loss::Squared } else { Loss::Distance },
-            team_reward: if paper { Team::Adversary } else { Team::Sum },
+            team_reward: if paper { TeamReward::Adversary } else { TeamReward::Sum },
         }
     }
 
@@ -127,6 +127,7 @@ fn build(spec: &Spec) -> Result<Box<dyn Scenario>, RegistryError> {
         space,
         physics: Physics::new(p.common.laws(), &vec![agent; n], &vec![landmark; n - 1], 0, true),
         steps: p.common.steps,
+        team: if p.team_reward == TeamReward::Sum { Team::Sum } else { Team::First },
     };
     Ok(Box::new(SimpleAdversary { params: p, base }))
 }
@@ -142,9 +143,9 @@ impl Scenario for SimpleAdversary {
 
     fn reward_convention(&self) -> &'static str {
         match (self.params.team_reward, self.params.adversary_loss) {
-            (Team::Adversary, Loss::Squared) => "the adversary's −|adversary − goal|², which all agents maximise",
-            (Team::Adversary, Loss::Distance) => "the adversary's −|adversary − goal|, which all agents maximise",
-            (Team::Sum, _) => "sum over agents: the adversary's −distance and what each good agent gains by it",
+            (TeamReward::Adversary, Loss::Squared) => "the adversary's −|adversary − goal|², which all agents maximise",
+            (TeamReward::Adversary, Loss::Distance) => "the adversary's −|adversary − goal|, which all agents maximise",
+            (TeamReward::Sum, _) => "sum over agents: the adversary's −distance and what each good agent gains by it",
         }
     }
 
@@ -177,7 +178,7 @@ impl Scenario for SimpleAdversary {
         }
     }
 
-    fn step(&self, state: &mut [f64], actions: &[f32], rewards: &mut [f32], scratch: &mut Scratch) -> f32 {
+    fn step(&self, state: &mut [f64], actions: &[f32], rewards: &mut [f32], scratch: &mut Scratch) {
         let n = self.params.common.agents;
         self.base.physics.step(state, self.base.space, actions, scratch);
         let world = self.base.physics.world(state);
@@ -190,10 +191,6 @@ impl Scenario for SimpleAdversary {
         let good = squared.sqrt() - nearest;
         rewards.fill(good as f32);
         rewards[0] = adversary as f32;
-        match self.params.team_reward {
-            Team::Adversary => adversary as f32,
-            Team::Sum => (adversary + good * (n - 1) as f64) as f32,
-        }
     }
 }
 
@@ -214,8 +211,8 @@ mod tests {
             let s = build(&Spec::new("simple_adversary").with("profile", profile)).unwrap();
             let (mut state, mut rewards) = (row(&*s), [9.0; 3]);
             let actions = vec![0.0; 3 * s.space().width()];
-            assert_eq!(s.step(&mut state, &actions, &mut rewards, &mut Scratch::default()), team);
-            assert_eq!(rewards, [adversary, 4.0, 4.0], "{profile}");
+            s.step(&mut state, &actions, &mut rewards, &mut Scratch::default());
+            assert_eq!((rewards, s.team_reward(&rewards)), ([adversary, 4.0, 4.0], team), "{profile}");
         }
     }
 

@@ -33,7 +33,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::params::{Common, Maybe, Profile, read};
-use super::{Base, Body, Build, Physics, Scenario, Scratch, Writer};
+use super::{Base, Body, Build, Physics, Scenario, Scratch, Team, Writer};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::{Stream, below};
 
@@ -147,6 +147,7 @@ fn build(spec: &Spec) -> Result<Box<dyn Scenario>, RegistryError> {
         space,
         physics: Physics::new(p.common.laws(), &[agent; AGENTS], &[landmark; LANDMARKS], words, true),
         steps: p.common.steps,
+        team: Team::Sum,
     };
     Ok(Box::new(SimpleReference { params: p, base }))
 }
@@ -206,7 +207,7 @@ impl Scenario for SimpleReference {
         }
     }
 
-    fn step(&self, state: &mut [f64], actions: &[f32], rewards: &mut [f32], scratch: &mut Scratch) -> f32 {
+    fn step(&self, state: &mut [f64], actions: &[f32], rewards: &mut [f32], scratch: &mut Scratch) {
         let p = &self.params;
         self.base.physics.step(state, self.base.space, actions, scratch);
         let world = self.base.physics.world(state);
@@ -222,7 +223,6 @@ impl Scenario for SimpleReference {
             }
         };
         rewards.copy_from_slice(&earned.map(|r| r as f32));
-        (earned[0] + earned[1]) as f32
     }
 }
 
@@ -251,7 +251,8 @@ mod tests {
         ] {
             let mut state = row(&*s, places, [1, 2]);
             let mut rewards = [9.0; 2];
-            assert_eq!(s.step(&mut state, &[0.0; 8], &mut rewards, &mut Scratch::default()), expected);
+            s.step(&mut state, &[0.0; 8], &mut rewards, &mut Scratch::default());
+            assert_eq!(s.team_reward(&rewards), expected);
             assert_eq!(rewards, [expected / 2.0; 2]);
         }
     }

@@ -33,7 +33,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::params::{Common, MAX_AGENTS, Maybe, Profile, read};
-use super::{Base, Body, Build, Physics, Scenario, Scratch, Writer};
+use super::{Base, Body, Build, Physics, Scenario, Scratch, Team, Writer};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Stream;
 
@@ -128,6 +128,7 @@ fn build(spec: &Spec) -> Result<Box<dyn Scenario>, RegistryError> {
         space,
         physics: Physics::new(p.common.laws(), &vec![agent; n], &vec![landmark; n], 0, false),
         steps: p.common.steps,
+        team: Team::Sum,
     };
     let sees = [radius * radius, if p.mask_landmarks { radius * radius } else { f64::INFINITY }];
     Ok(Box::new(SimpleSpread { params: p, base, sees }))
@@ -178,7 +179,7 @@ impl Scenario for SimpleSpread {
         }
     }
 
-    fn step(&self, state: &mut [f64], actions: &[f32], rewards: &mut [f32], scratch: &mut Scratch) -> f32 {
+    fn step(&self, state: &mut [f64], actions: &[f32], rewards: &mut [f32], scratch: &mut Scratch) {
         let (p, n) = (&self.params, self.params.common.agents);
         self.base.physics.step(state, self.base.space, actions, scratch);
         let world = self.base.physics.world(state);
@@ -194,14 +195,10 @@ impl Scenario for SimpleSpread {
         let reach = 4.0 * p.agent_size * p.agent_size;
         let itself = usize::from(p.self_collision && p.agent_size > 0.0);
         let weights = p.local_ratio.0.map_or([1.0, 1.0], |own| [1.0 - own, own]);
-        let mut team = 0.0;
         for (i, reward) in rewards.iter_mut().enumerate() {
             let hits = (0..n).filter(|&a| a != i && world.squared_distance(a, i) < reach).count() + itself;
-            let r = weights[0] * shared - weights[1] * p.collision_penalty * hits as f64;
-            *reward = r as f32;
-            team += r;
+            *reward = (weights[0] * shared - weights[1] * p.collision_penalty * hits as f64) as f32;
         }
-        team as f32
     }
 }
 
@@ -278,14 +275,14 @@ mod tests {
         let mut state = row(&*s, &[[0.0, 0.0], [0.29, 0.0], [5.0, 0.0], [0.0, 1.0], [0.29, 0.0], [5.0, 0.5]]);
         let mut rewards = [0.0; 3];
         // The contact of agents 0 and 1 moves them apart by about 0.01 · 100 · 0.1² each within the step.
-        let team = s.step(&mut state, &[0.0; 6], &mut rewards, &mut Scratch::default());
+        s.step(&mut state, &[0.0; 6], &mut rewards, &mut Scratch::default());
         let world = s.shape().world(&state);
         let nearest = |l: usize| (0..3).map(|a| world.distance(a, l)).fold(9.0, f64::min);
         let distances = nearest(3) + nearest(4) + nearest(5);
         let hit = f64::from(u8::from(world.squared_distance(0, 1) < 0.09));
         assert!((f64::from(rewards[0]) + distances + 1.0 + hit).abs() < 1e-6);
         assert!((f64::from(rewards[2]) + distances + 1.0).abs() < 1e-6, "it collides with itself only");
-        assert!((team - rewards.iter().sum::<f32>()).abs() < 1e-5);
+        assert!((s.team_reward(&rewards) - rewards.iter().sum::<f32>()).abs() < 1e-5);
     }
 
     #[test]
@@ -294,7 +291,9 @@ mod tests {
         for (own, expected) in [(true, 0.0), (false, 3.0)] {
             let s = scenario(&Spec::new("simple_spread").with("self_collision", own));
             let mut state = row(&*s, &[places, places].concat());
-            assert_eq!(s.step(&mut state, &[0.0; 6], &mut [0.0; 3], &mut Scratch::default()), expected);
+            let mut rewards = [9.0; 3];
+            s.step(&mut state, &[0.0; 6], &mut rewards, &mut Scratch::default());
+            assert_eq!(s.team_reward(&rewards), expected);
         }
     }
 

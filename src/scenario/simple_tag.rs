@@ -37,7 +37,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::params::{Common, MAX_AGENTS, Maybe, Profile, read};
-use super::{Base, Body, Build, Physics, Scenario, Scratch, World, Writer};
+use super::{Base, Body, Build, Physics, Scenario, Scratch, Team, World, Writer};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Stream;
 use crate::schema::{AgentSpec, Controller};
@@ -92,7 +92,7 @@ struct Params {
     /// Whether the prey loses by contacts and by leaving the arena, and its reward counts for the team.
     prey_reward: bool,
     /// What the team earns of the predators' rewards.
-    team_reward: Team,
+    team_reward: TeamReward,
 }
 
 /// What the prey maximises.
@@ -108,7 +108,7 @@ enum PreyScore {
 /// What the team earns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-enum Team {
+enum TeamReward {
     /// The predators' shared reward, once.
     Once,
     /// The sum over all agents.
@@ -136,7 +136,7 @@ impl Params {
             view_radius: Maybe(paper.then_some(0.25)),
             contact_reward: 10.0,
             prey_reward: !paper,
-            team_reward: if paper { Team::Once } else { Team::Sum },
+            team_reward: if paper { TeamReward::Once } else { TeamReward::Sum },
         }
     }
 
@@ -193,6 +193,7 @@ fn build(spec: &Spec) -> Result<Box<dyn Scenario>, RegistryError> {
         space: p.common.space(0),
         physics: Physics::new(p.common.laws(), &bodies, &obstacles, 0, false),
         steps: p.common.steps,
+        team: if p.team_reward == TeamReward::Sum { Team::Sum } else { Team::First },
     };
     let radius = p.view_radius.or_infinite();
     Ok(Box::new(SimpleTag { params: p, base, sees: radius * radius }))
@@ -227,8 +228,10 @@ impl Scenario for SimpleTag {
 
     fn reward_convention(&self) -> &'static str {
         match self.params.team_reward {
-            Team::Once => "10 per predator-prey contact and step, summed over predators, counted once for the team",
-            Team::Sum => "sum over agents: the contacts once per predator, and the prey's own reward",
+            TeamReward::Once => {
+                "10 per predator-prey contact and step, summed over predators, counted once for the team"
+            }
+            TeamReward::Sum => "sum over agents: the contacts once per predator, and the prey's own reward",
         }
     }
 
@@ -280,7 +283,7 @@ impl Scenario for SimpleTag {
         }
     }
 
-    fn step(&self, state: &mut [f64], actions: &[f32], rewards: &mut [f32], scratch: &mut Scratch) -> f32 {
+    fn step(&self, state: &mut [f64], actions: &[f32], rewards: &mut [f32], scratch: &mut Scratch) {
         let (p, prey) = (&self.params, self.prey());
         self.base.physics.step(state, self.base.space, actions, scratch);
         let world = self.base.physics.world(state);
@@ -294,10 +297,6 @@ impl Scenario for SimpleTag {
         };
         rewards[..prey].fill(shared as f32);
         rewards[prey] = own as f32;
-        match p.team_reward {
-            Team::Once => shared as f32,
-            Team::Sum => (shared * prey as f64 + own) as f32,
-        }
     }
 }
 
@@ -335,7 +334,8 @@ mod tests {
         // 0.025 deep on both sides: each predator leaves at 0.25 per second, 0.025 in the step, and still just touches.
         s.shape().push(&mut state, 0, [-0.2, 0.0]);
         s.shape().push(&mut state, 1, [0.2, 0.0]);
-        assert_eq!(s.step(&mut state, &[0.0; 8], &mut rewards, &mut Scratch::default()), 20.0);
+        s.step(&mut state, &[0.0; 8], &mut rewards, &mut Scratch::default());
+        assert_eq!(s.team_reward(&rewards), 20.0);
         assert_eq!(rewards, [20.0, 20.0, 20.0, 0.0]);
     }
 
@@ -345,9 +345,9 @@ mod tests {
         let mut state = row(&*s, &[[0.95, -0.5], [0.95, 0.5], [0.95, 0.5], [9.0, 9.0], [-9.0, 9.0]]);
         let mut rewards = [9.0; 3];
         // old velocities (none) move first, and two bodies in one place do not push
-        let team = s.step(&mut state, &[0.0; 15], &mut rewards, &mut Scratch::default());
+        s.step(&mut state, &[0.0; 15], &mut rewards, &mut Scratch::default());
         assert_eq!(rewards, [10.0, 10.0, -10.5]);
-        assert_eq!(team, 9.5);
+        assert_eq!(s.team_reward(&rewards), 9.5);
         assert_eq!([0.5, 0.95, 1.0, 1.5, 3.0].map(bound), [0.0, 10.0 * (0.95 - 0.9), 1.0, libm::exp(1.0), 10.0]);
     }
 

@@ -78,7 +78,8 @@ impl<'a> Worlds<'a> {
         let agents = self.scenario.agents().len();
         let rows = actions.chunks_exact(self.action).zip(rewards.chunks_exact_mut(agents)).zip(team);
         for (state, ((actions, rewards), team)) in self.state.chunks_exact_mut(self.width).zip(rows) {
-            *team = self.scenario.step(state, actions, rewards, &mut self.scratch);
+            self.scenario.step(state, actions, rewards, &mut self.scratch);
+            *team = self.scenario.team_reward(rewards);
         }
     }
 }

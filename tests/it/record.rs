@@ -120,7 +120,8 @@ fn messages_are_what_was_sent_and_rows_replay_through_the_scenario() {
     let (mut state, mut rewards) = (episode.state[..width].to_vec(), vec![0.0; 4]);
     for t in 0..episode.steps {
         let actions: Vec<f32> = episode.actions.iter().flat_map(|m| m.row(t).to_vec()).collect();
-        assert_eq!(parts.0.step(&mut state, &actions, &mut rewards, &mut Scratch::default()), episode.reward[t]);
+        parts.0.step(&mut state, &actions, &mut rewards, &mut Scratch::default());
+        assert_eq!(parts.0.team_reward(&rewards), episode.reward[t]);
         assert_eq!(state, episode.state[(t + 1) * width..(t + 2) * width]);
     }
 }
