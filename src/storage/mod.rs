@@ -19,8 +19,17 @@ pub const FORMATS: &[Entry<Format>] = &[mcap::ENTRY, parquet::ENTRY];
 /// Largest manifest that is read, bytes.
 const MANIFEST_LIMIT: u64 = 64 << 20;
 
-/// Starts a store at a path, for a manifest, with or without `force`.
-pub type Create = fn(&Path, &Manifest, bool) -> Result<Box<dyn EpisodeSink>, StorageError>;
+/// Starts a store at a path, for a manifest.
+pub type Create = fn(&Path, &Manifest, Options) -> Result<Box<dyn EpisodeSink>, StorageError>;
+
+/// How a store is written.
+#[derive(Clone, Copy, Debug)]
+pub struct Options {
+    /// Replace what ccmarl wrote under this name before.
+    pub force: bool,
+    /// Also write what viewers draw, where the format has viewers; the rollouts do not depend on it.
+    pub viewer: bool,
+}
 
 /// How a format is recognised, written and read.
 #[derive(Clone, Copy, Debug)]
@@ -117,15 +126,23 @@ pub enum StorageError {
     },
 }
 
-/// Starts a store at `path`; its extension chooses the format (`.mcap`, `.parquet`, anything else a directory of
-/// Parquet parts).
+/// Starts a store at `path`, with what viewers draw; its extension chooses the format (`.mcap`, `.parquet`, anything
+/// else a directory of Parquet parts).
 ///
 /// # Errors
 /// [`IoError::Exists`] without `force`; [`StorageError`] when the disk refuses.
 pub fn create(path: &Path, manifest: &Manifest, force: bool) -> Result<Box<dyn EpisodeSink>, StorageError> {
-    crate::io::refuse_existing(path, force)?;
+    create_with(path, manifest, Options { force, viewer: true })
+}
+
+/// Starts a store at `path`, as [`create`] does, with options.
+///
+/// # Errors
+/// As [`create`].
+pub fn create_with(path: &Path, manifest: &Manifest, options: Options) -> Result<Box<dyn EpisodeSink>, StorageError> {
+    crate::io::refuse_existing(path, options.force)?;
     crate::io::keep_freed_memory();
-    (format_of(path).build.create)(path, manifest, force)
+    (format_of(path).build.create)(path, manifest, options)
 }
 
 /// Opens the store at `path`.
