@@ -7,6 +7,7 @@ mod evaluate;
 mod generate;
 mod inspect;
 mod list;
+mod pairs;
 mod quickstart;
 mod record;
 mod report;
@@ -42,6 +43,8 @@ enum Command {
     Record(record::Args),
     /// Show what a recorded store holds
     Inspect(inspect::Args),
+    /// Turn a store into a table with one row per episode, step, sender and receiver
+    Pairs(pairs::Args),
     /// Estimate how much messages and actions, or any columns, tell about each other
     EstimateMi(estimate_mi::Args),
     /// Train a team over a link prior
@@ -90,6 +93,7 @@ fn dispatch(command: Command) -> anyhow::Result<Outcome> {
         Command::Quickstart(args) => quickstart::run(&args),
         Command::Record(args) => record::run(&args),
         Command::Inspect(args) => inspect::run(&args),
+        Command::Pairs(args) => pairs::run(&args),
         Command::EstimateMi(args) => estimate_mi::run(&args),
         Command::Train(args) => train::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),

@@ -8,6 +8,8 @@ mod tally;
 
 use std::path::{Path, PathBuf};
 
+pub use parquet::PairsWriter;
+
 use crate::io::IoError;
 use crate::registry::Entry;
 use crate::schema::{Episode, Manifest, SchemaError};
@@ -18,6 +20,9 @@ pub const FORMATS: &[Entry<Format>] = &[mcap::ENTRY, parquet::ENTRY];
 
 /// Largest manifest that is read, bytes.
 const MANIFEST_LIMIT: u64 = 64 << 20;
+
+/// Metadata key of a table of pairs.
+const PAIRS_KEY: &str = "ccmarl.pairs";
 
 /// Starts a store at a path, for a manifest.
 pub type Create = fn(&Path, &Manifest, Options) -> Result<Box<dyn EpisodeSink>, StorageError>;
@@ -185,7 +190,7 @@ fn start_partial(path: &Path, force: bool) -> Result<PathBuf, IoError> {
 }
 
 /// Whether ccmarl made what stands at `path`: an empty directory or file, one with a rollout manifest, or a file that
-/// carries our metadata key in its last mebibyte.
+/// carries one of our metadata keys in its last mebibyte.
 fn is_ours(path: &Path) -> Result<bool, IoError> {
     use std::io::{Read as _, Seek as _, SeekFrom};
     if path.is_dir() {
@@ -201,8 +206,8 @@ fn is_ours(path: &Path) -> Result<bool, IoError> {
     let mut tail = Vec::new();
     file.seek(SeekFrom::Start(size.saturating_sub(1 << 20))).map_err(IoError::os("read", path))?;
     file.take(1 << 20).read_to_end(&mut tail).map_err(IoError::os("read", path))?;
-    let key = b"ccmarl.manifest";
-    Ok(size == 0 || tail.windows(key.len()).any(|w| w == key))
+    let holds = |key: &str| tail.windows(key.len()).any(|w| w == key.as_bytes());
+    Ok(size == 0 || holds("ccmarl.manifest") || holds(PAIRS_KEY))
 }
 
 /// The first format that claims the path; Parquet when none does.

@@ -30,10 +30,13 @@ mod decoder;
 mod encoder;
 mod group;
 mod journal;
+mod pairs;
 mod sink;
 mod source;
 
 use std::path::Path;
+
+pub use pairs::PairsWriter;
 
 use super::{EpisodeSink, EpisodeSource, Format, Options, StorageError};
 use crate::registry::Entry;
