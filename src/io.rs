@@ -100,8 +100,11 @@ pub fn partial_path(path: &Path) -> PathBuf {
 }
 
 fn hidden_sibling(path: &Path, ending: &str) -> PathBuf {
-    let name = path.file_name().map_or_else(|| "out".into(), |n| n.to_string_lossy().into_owned());
-    path.with_file_name(format!(".{name}.{ending}"))
+    let mut name = std::ffi::OsString::from(".");
+    name.push(path.file_name().unwrap_or("out".as_ref())); // the name's own bytes: it need not be UTF-8
+    name.push(".");
+    name.push(ending);
+    path.with_file_name(name)
 }
 
 /// Puts a finished file or directory under its final name, replacing what `force` allows it to replace.

@@ -25,12 +25,7 @@ impl Tally {
             let message = format!("expected episode {}, found {}", self.episodes, episode.index);
             return Err(value("episode", message));
         }
-        if episode.steps >= i32::MAX as usize {
-            return Err(value("step", format!("{} steps are more than a step number holds", episode.steps)));
-        }
-        episode.check(layout)?;
-        finite(layout, episode)?;
-        Ok(episode.content_hash())
+        examine(layout, episode)
     }
 
     /// Counts an episode with this content hash.
@@ -54,6 +49,9 @@ impl Tally {
         manifest.episodes = self.episodes;
         manifest.steps = self.steps;
         manifest.content = self.content();
+        if manifest.planned <= self.episodes {
+            manifest.planned = 0; // all there
+        }
         Ok(())
     }
 
@@ -71,6 +69,17 @@ impl Tally {
         }
         Ok(())
     }
+}
+
+/// Checks an episode, whatever its number, and returns its content hash.
+pub(super) fn examine(layout: &Layout, episode: &Episode) -> Result<[u8; 32], SchemaError> {
+    if episode.steps >= i32::MAX as usize {
+        let message = format!("{} steps are more than a step number holds", episode.steps);
+        return Err(SchemaError::Value { column: "step".to_owned(), message });
+    }
+    episode.check(layout)?;
+    finite(layout, episode)?;
+    Ok(episode.content_hash())
 }
 
 /// Refuses NaN and infinities: no sum or estimate over them would mean anything.
