@@ -174,6 +174,16 @@ pub fn sha256_file(path: &Path) -> Result<(String, u64), IoError> {
     }
 }
 
+/// Keeps freed memory in the process for what is allocated next.
+///
+/// A store is written and read in column buffers of some hundred kilobytes. By default glibc gives each of them back to
+/// the system, which hands it out again page by page: a quarter of the processor time of a recording, measured. It stops
+/// that for sizes up to the largest block that was freed, so one such block, never touched, is enough. Elsewhere this
+/// does nothing.
+pub fn keep_freed_memory() {
+    drop(std::hint::black_box(Vec::<u8>::with_capacity(31 << 20)));
+}
+
 /// Text that came from a file, safe to print on a terminal: control characters are shown escaped.
 pub fn printable(text: &str) -> String {
     text.chars().flat_map(|c| if c.is_control() { c.escape_default().collect() } else { vec![c] }).collect()

@@ -43,6 +43,14 @@ pub trait EpisodeSink: Send {
     /// [`StorageError`] when the episode is out of order, breaks the schema or holds a NaN, or the disk refuses.
     fn append(&mut self, episode: &Episode) -> Result<(), StorageError>;
 
+    /// Appends the next episodes; a sink that can works on them with all threads of the caller's pool.
+    ///
+    /// # Errors
+    /// As [`EpisodeSink::append`].
+    fn append_all(&mut self, episodes: &[Episode]) -> Result<(), StorageError> {
+        episodes.iter().try_for_each(|episode| self.append(episode))
+    }
+
     /// Hands all episodes appended so far to the operating system: once this returns they survive the death of the
     /// process. Returns how many these are. Costs one write; call it per batch of episodes.
     ///
@@ -116,6 +124,7 @@ pub enum StorageError {
 /// [`IoError::Exists`] without `force`; [`StorageError`] when the disk refuses.
 pub fn create(path: &Path, manifest: &Manifest, force: bool) -> Result<Box<dyn EpisodeSink>, StorageError> {
     crate::io::refuse_existing(path, force)?;
+    crate::io::keep_freed_memory();
     (format_of(path).build.create)(path, manifest, force)
 }
 
@@ -131,6 +140,7 @@ pub fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
         }
         return Err(IoError::Missing(path.to_owned()).into());
     }
+    crate::io::keep_freed_memory();
     let source = (format_of(path).build.open)(path)?;
     if source.manifest().episodes == 0 {
         let message = "it holds zero episodes: record again".to_owned();

@@ -28,6 +28,8 @@
 mod columns;
 mod decoder;
 mod encoder;
+mod group;
+mod journal;
 mod sink;
 mod source;
 

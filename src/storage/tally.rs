@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use rayon::prelude::*;
 use sha2::{Digest as _, Sha256};
 
 use super::StorageError;
@@ -20,12 +21,14 @@ pub(super) struct Tally {
 impl Tally {
     /// Checks the next episode of a store and returns its content hash. `self` counts the whole store.
     pub(super) fn check(&self, layout: &Layout, episode: &Episode) -> Result<[u8; 32], SchemaError> {
-        let value = |column: &str, message: String| SchemaError::Value { column: column.to_owned(), message };
-        if episode.index != self.episodes {
-            let message = format!("expected episode {}, found {}", self.episodes, episode.index);
-            return Err(value("episode", message));
-        }
-        examine(layout, episode)
+        check(layout, episode, self.episodes)
+    }
+
+    /// Checks the next episodes of a store, side by side, and returns their content hashes.
+    pub(super) fn check_all(&self, layout: &Layout, episodes: &[Episode]) -> Result<Vec<[u8; 32]>, SchemaError> {
+        let expected = (self.episodes..).zip(episodes).collect::<Vec<_>>();
+        let checked: Vec<_> = expected.into_par_iter().map(|(index, episode)| check(layout, episode, index)).collect();
+        checked.into_iter().collect() // the first error by index, whichever thread was first
     }
 
     /// Counts an episode with this content hash.
@@ -71,11 +74,15 @@ impl Tally {
     }
 }
 
-/// Checks an episode, whatever its number, and returns its content hash.
-pub(super) fn examine(layout: &Layout, episode: &Episode) -> Result<[u8; 32], SchemaError> {
+/// Checks an episode that must have number `expected`; its content hash.
+pub(super) fn check(layout: &Layout, episode: &Episode, expected: u64) -> Result<[u8; 32], SchemaError> {
+    let value = |column: &str, message: String| SchemaError::Value { column: column.to_owned(), message };
+    if episode.index != expected {
+        let message = format!("expected episode {expected}, found {}", episode.index);
+        return Err(value("episode", message));
+    }
     if episode.steps >= i32::MAX as usize {
-        let message = format!("{} steps are more than a step number holds", episode.steps);
-        return Err(SchemaError::Value { column: "step".to_owned(), message });
+        return Err(value("step", format!("{} steps are more than a step number holds", episode.steps)));
     }
     episode.check(layout)?;
     finite(layout, episode)?;

@@ -6,7 +6,7 @@ use prost::Message as _;
 
 use super::{EPISODE_TOPIC, STEP_TOPIC, proto};
 use crate::schema::{Episode, Layout};
-use crate::storage::tally::examine;
+use crate::storage::tally::check;
 
 /// The channels of a file that matter here, by id.
 #[derive(Default)]
@@ -110,7 +110,7 @@ impl Assembler {
         }
         let mut episode = self.start(index + 1);
         episode.steps = rows - 1;
-        let hash = examine(&self.layout, &episode).map_err(|e| format!("episode {index}: {e}"))?;
+        let hash = check(&self.layout, &episode, index).map_err(|e| format!("episode {index}: {e}"))?;
         if end.content_hash != hash {
             return Err(format!("episode {index} does not have the content hash at its end"));
         }

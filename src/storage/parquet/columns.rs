@@ -98,7 +98,7 @@ pub(super) fn properties(schema: &Schema) -> WriterProperties {
 }
 
 /// A block of whole episodes as columns.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub(super) struct Block {
     /// Rows held.
     pub(super) rows: usize,
@@ -161,30 +161,6 @@ impl Block {
         }
         self.reward.extend_from_slice(&e.reward);
         self.reward.push(0.0);
-    }
-
-    /// A copy of the rows from `from` on.
-    pub(super) fn tail(&self, from: usize) -> Self {
-        fn cut<T: Clone>(column: &[T], from: usize, rows: usize) -> Vec<T> {
-            column[from * (column.len() / rows.max(1))..].to_vec()
-        }
-        let rows = self.rows;
-        let floats = |columns: &[Vec<f32>]| columns.iter().map(|c| cut(c, from, rows)).collect();
-        Self {
-            rows: rows - from,
-            episode: cut(&self.episode, from, rows),
-            step: cut(&self.step, from, rows),
-            first: cut(&self.first, from, rows),
-            last: cut(&self.last, from, rows),
-            terminal: cut(&self.terminal, from, rows),
-            state: cut(&self.state, from, rows),
-            observations: floats(&self.observations),
-            messages: floats(&self.messages),
-            link: cut(&self.link, from, rows),
-            actions: floats(&self.actions),
-            reward: cut(&self.reward, from, rows),
-            rewards: floats(&self.rewards),
-        }
     }
 
     /// The block as a record batch of `schema`, without copying its floats.
