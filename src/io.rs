@@ -140,7 +140,10 @@ pub fn publish(from: &Path, to: &Path, force: bool, marker: &str) -> Result<(), 
 }
 
 /// Removes a file, a link (not what it points to) or a directory, if it is there.
-fn remove(path: &Path) -> Result<(), IoError> {
+///
+/// # Errors
+/// [`IoError::Os`].
+pub fn remove(path: &Path) -> Result<(), IoError> {
     let Ok(found) = path.symlink_metadata() else { return Ok(()) };
     let removed = if found.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
     removed.map_err(IoError::os("remove", path))

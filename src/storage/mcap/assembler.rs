@@ -104,7 +104,8 @@ impl Assembler {
     fn close(&mut self, end: &proto::Episode) -> Result<(Episode, [u8; 32]), String> {
         let rows = self.rows;
         let index = self.episode.index;
-        if end.index != index || end.steps.checked_add(1) != Some(rows as u64) || end.terminal != self.episode.terminal {
+        if end.index != index || end.steps.checked_add(1) != Some(rows as u64) || end.terminal != self.episode.terminal
+        {
             let (other, steps) = (end.index, end.steps);
             return Err(format!("episode {index} of {rows} rows: its end says episode {other} of {steps} steps"));
         }

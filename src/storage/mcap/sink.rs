@@ -13,7 +13,7 @@ use super::proto::{self, DESCRIPTORS};
 use super::{EPISODE_TOPIC, JSON_KEY, MANIFEST_RECORD, RECORDING_RECORD, STEP_TOPIC};
 use crate::io::{self, IoError};
 use crate::schema::{Episode, Layout, Manifest, STEP_SECS};
-use crate::storage::{EpisodeSink, StorageError, Tally, start_partial};
+use crate::storage::{EpisodeSink, StorageError, Tally, lock, start_partial};
 
 /// A store under construction, in the hidden sibling `.<name>.partial`.
 pub(super) struct McapSink {
@@ -41,6 +41,7 @@ impl McapSink {
         let unsealed = Manifest { parts: Vec::new(), ..manifest.clone() }.sealed_json().map_err(schema)?;
         let partial = start_partial(path, force)?;
         let file = File::create_new(&partial).map_err(IoError::os("create", &partial))?;
+        lock::hold_file(&file, &partial)?;
         let started = start(file, unsealed).map_err(|e| refused(e, &partial))?;
         let (writer, step_channel, episode_channel) = started;
         let agents = layout.agents.iter().map(|a| proto::Agent { name: a.name.clone(), ..proto::Agent::default() });
