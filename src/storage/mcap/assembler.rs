@@ -115,7 +115,7 @@ impl Assembler {
         if end.content_hash != hash {
             return Err(format!("episode {index} does not have the content hash at its end"));
         }
-        if end.episode_return.to_bits() != episode.episode_return().to_bits() {
+        if end.episode_return != episode.episode_return() {
             let (said, sum) = (end.episode_return, episode.episode_return());
             return Err(format!("episode {index}: its end says return {said}, its rewards sum to {sum}"));
         }
