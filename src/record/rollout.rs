@@ -70,7 +70,8 @@ impl Recording<'_> {
     pub fn manifest(&self) -> Manifest {
         let [scenario, link, policy] =
             [self.scenario.parameters(), self.link.parameters(), self.policy.parameters()].map(Into::into);
-        Manifest::new(self.seed, scenario, link, policy, &self.layout())
+        let manifest = Manifest::new(self.seed, scenario, link, policy, &self.layout());
+        Manifest { planned: self.episodes, ..manifest }
     }
 
     /// Episode number `index`: the same for the same seed, whoever asks and in whatever order.

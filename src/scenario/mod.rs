@@ -75,6 +75,11 @@ pub trait Scenario: Send + Sync {
     /// Writes the oracle's actions of the policy agents (a hand-written rule that sees the whole state).
     fn oracle(&self, world: &World, actions: &mut [f32]);
 
+    /// The team reward of a step from the agents' rewards, where it follows from them.
+    fn team_reward(&self, _rewards: &[f32]) -> Option<f32> {
+        None
+    }
+
     /// Moves the world by one step of `dt` under all agents' actions and writes each agent's reward.
     /// Returns the team reward that a trainer optimises.
     fn step(&self, world: &mut World, actions: &[f32], rewards: &mut [f32]) -> f32;

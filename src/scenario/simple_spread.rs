@@ -183,6 +183,10 @@ impl Scenario for SimpleSpread {
         "sum over agents of (−distances − collisions, self included, + bonus when all are covered)"
     }
 
+    fn team_reward(&self, rewards: &[f32]) -> Option<f32> {
+        Some(rewards.iter().map(|&r| f64::from(r)).sum::<f64>() as f32)
+    }
+
     fn world(&self) -> World {
         self.physics.world()
     }

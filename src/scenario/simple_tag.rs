@@ -244,6 +244,10 @@ impl Scenario for SimpleTag {
         "10 per predator-prey contact and step, summed over predators, counted once for the team"
     }
 
+    fn team_reward(&self, rewards: &[f32]) -> Option<f32> {
+        rewards.first().copied()
+    }
+
     fn world(&self) -> World {
         self.physics.world()
     }

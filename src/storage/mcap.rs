@@ -25,6 +25,8 @@
 //! # Differences from the reference implementation
 //! None in the container. Checksums may be absent in MCAP at large; here they must be there.
 
+mod assembler;
+mod diagnose;
 mod proto;
 mod sink;
 mod source;
@@ -57,7 +59,7 @@ pub(super) const ENTRY: Entry<Format> = Entry {
     summary: "one .mcap file of protobuf messages",
     reference: "MCAP specification",
     value: None,
-    build: Format { claims, create, open },
+    build: Format { claims, create, open, salvage, diagnose: diagnose::diagnose },
 };
 
 fn claims(path: &Path) -> bool {
@@ -70,4 +72,8 @@ fn create(path: &Path, manifest: &Manifest, options: Options) -> Result<Box<dyn 
 
 fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
     Ok(Box::new(source::McapSource::open(path)?))
+}
+
+fn salvage(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
+    Ok(Box::new(source::McapSource::salvage(path)?))
 }

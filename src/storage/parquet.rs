@@ -27,10 +27,13 @@
 
 mod columns;
 mod decoder;
+mod diagnose;
 mod encoder;
 mod group;
 mod journal;
+mod pages;
 mod pairs;
+mod salvage;
 mod sink;
 mod source;
 
@@ -57,7 +60,7 @@ pub(super) const ENTRY: Entry<Format> = Entry {
     summary: "a directory of Parquet parts with a manifest, or one .parquet file",
     reference: "Apache Parquet",
     value: None,
-    build: Format { claims, create, open },
+    build: Format { claims, create, open, salvage, diagnose: diagnose::diagnose },
 };
 
 fn claims(path: &Path) -> bool {
@@ -82,6 +85,10 @@ fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
             "expected a directory, a .parquet or a .mcap file; for a table use `ccmarl estimate-mi FILE --x … --y …`";
         Err(StorageError::NotAStore { message: message.to_owned(), path: path.to_owned() })
     }
+}
+
+fn salvage(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
+    Ok(Box::new(salvage::Leftover::open(path)?))
 }
 
 /// Where the 64 digits of the file's own digest begin in the end of its footer: after the key stand two bytes of

@@ -52,6 +52,9 @@ impl Tally {
         manifest.episodes = self.episodes;
         manifest.steps = self.steps;
         manifest.content = self.content();
+        if manifest.planned <= self.episodes {
+            manifest.planned = 0; // all there
+        }
         Ok(())
     }
 
@@ -72,7 +75,7 @@ impl Tally {
 }
 
 /// Checks an episode that must have number `expected`; its content hash.
-fn check(layout: &Layout, episode: &Episode, expected: u64) -> Result<[u8; 32], SchemaError> {
+pub(super) fn check(layout: &Layout, episode: &Episode, expected: u64) -> Result<[u8; 32], SchemaError> {
     let value = |column: &str, message: String| SchemaError::Value { column: column.to_owned(), message };
     if episode.index != expected {
         let message = format!("expected episode {expected}, found {}", episode.index);

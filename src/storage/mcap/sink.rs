@@ -14,7 +14,7 @@ use super::viewer::Viewer;
 use super::{EPISODE_TOPIC, JSON_KEY, MANIFEST_RECORD, POSES_TOPIC, RECORDING_RECORD, SCENE_TOPIC, STEP_TOPIC};
 use crate::io::{self, IoError};
 use crate::schema::{Episode, Layout, Manifest, STEP_SECS};
-use crate::storage::{EpisodeSink, Options, StorageError, Tally, start_partial};
+use crate::storage::{EpisodeSink, Options, StorageError, Tally, lock, start_partial};
 
 /// A store under construction, in the hidden sibling `.<name>.partial`.
 pub(super) struct McapSink {
@@ -43,6 +43,7 @@ impl McapSink {
         let unsealed = Manifest { parts: Vec::new(), ..manifest.clone() }.sealed_json().map_err(schema)?;
         let partial = start_partial(path, options.force)?;
         let file = File::create_new(&partial).map_err(IoError::os("create", &partial))?;
+        lock::hold_file(&file, &partial)?;
         let viewer = if options.viewer { Viewer::new(manifest, &layout) } else { None };
         let (writer, channels) = start(file, unsealed, viewer.is_some()).map_err(|e| refused(e, &partial))?;
         let agents = layout.agents.iter().map(|a| proto::Agent { name: a.name.clone(), ..proto::Agent::default() });

@@ -30,7 +30,7 @@ impl Journal {
         schema: &SchemaRef,
         manifest: String,
     ) -> Result<Self, StorageError> {
-        let path = directory.join(format!("journal-{part:05}.arrows"));
+        let path = directory.join(journal_name(part));
         let file = File::create_new(&path).map_err(IoError::os("create", &path))?;
         let entries = Metadata::from([(MANIFEST_KEY, manifest)]);
         let described = Schema::new_with_metadata(schema.fields().clone(), entries);
@@ -65,4 +65,9 @@ pub(super) fn refused(error: ArrowError, path: &Path) -> StorageError {
         other => std::io::Error::other(other.to_string()),
     };
     IoError::os("write", path)(source).into()
+}
+
+/// Name of the journal of part `part`.
+pub(super) fn journal_name(part: usize) -> String {
+    format!("journal-{part:05}.arrows")
 }

@@ -1,5 +1,6 @@
 //! Writing: episodes go to the journal and to the encoder; blocks, row groups and files are cut at fixed counts.
 
+use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use arrow::datatypes::SchemaRef;
@@ -11,7 +12,7 @@ use super::journal::{Journal, refused};
 use super::{MANIFEST_FILE, MANIFEST_KEY, PART_KEY, is_single};
 use crate::io::{self, IoError};
 use crate::schema::{Episode, Layout, Manifest, Part};
-use crate::storage::{EpisodeSink, StorageError, Tally, start_partial};
+use crate::storage::{EpisodeSink, StorageError, Tally, lock, start_partial};
 
 /// Rows that are encoded at once.
 const BLOCK_ROWS: usize = 8192;
@@ -40,6 +41,8 @@ pub(super) struct ParquetSink {
     part_start: u64,
     parts: Vec<Part>,
     total: Tally,
+    /// Held until the store has its name.
+    _lock: File,
     finished: bool,
 }
 
@@ -103,6 +106,7 @@ impl ParquetSink {
         layout.check().map_err(|source| StorageError::Schema { source, path: path.to_owned() })?;
         let partial = start_partial(path, force)?;
         std::fs::create_dir(&partial).map_err(IoError::os("create the directory", &partial))?;
+        let lock = lock::hold_directory(&partial)?;
         let schema = schema(&layout);
         let encoder = Encoder::start(SchemaRef::clone(&schema), &partial, part_name)?;
         let rows = Rows { schema: SchemaRef::clone(&schema), block: Block::new(&layout, 0), group: 0, encoder };
@@ -121,6 +125,7 @@ impl ParquetSink {
             part_start: 0,
             parts: Vec::new(),
             total: Tally::default(),
+            _lock: lock,
             finished: false,
         };
         sink.start_journal()?;
@@ -234,6 +239,7 @@ impl EpisodeSink for ParquetSink {
         self.manifest.parts = parts;
         let text = self.manifest.sealed_json().map_err(schema)?;
         io::write_atomic(&self.partial.join(MANIFEST_FILE), text.as_bytes())?;
+        lock::release(&self.partial)?;
         io::sync_dir(&self.partial)?;
         io::publish(&self.partial, &self.path, self.force, MANIFEST_FILE)?;
         self.finished = true;
@@ -254,6 +260,6 @@ impl Drop for ParquetSink {
     }
 }
 
-fn part_name(index: usize) -> String {
+pub(super) fn part_name(index: usize) -> String {
     format!("part-{index:05}.parquet")
 }
