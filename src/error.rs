@@ -54,6 +54,8 @@ impl Error {
             Self::Registry(e) | Self::Train(TrainError::Registry(e)) => !matches!(e, RegistryError::Data(_)),
             Self::Usage(_)
             | Self::Record(RecordError::NoEpisodes)
+            | Self::Storage(StorageError::Extension { .. })
+            | Self::Train(TrainError::Storage(StorageError::Extension { .. }))
             | Self::Report(ReportError::NoInput)
             | Self::Train(TrainError::Config { .. } | TrainError::Value { .. }) => true,
             Self::Io(e)

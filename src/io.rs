@@ -100,8 +100,11 @@ pub fn partial_path(path: &Path) -> PathBuf {
 }
 
 fn hidden_sibling(path: &Path, ending: &str) -> PathBuf {
-    let name = path.file_name().map_or_else(|| "out".into(), |n| n.to_string_lossy().into_owned());
-    path.with_file_name(format!(".{name}.{ending}"))
+    let mut name = std::ffi::OsString::from(".");
+    name.push(path.file_name().unwrap_or("out".as_ref())); // the name's own bytes: it need not be UTF-8
+    name.push(".");
+    name.push(ending);
+    path.with_file_name(name)
 }
 
 /// Puts a finished file or directory under its final name, replacing what `force` allows it to replace.
@@ -137,7 +140,10 @@ pub fn publish(from: &Path, to: &Path, force: bool, marker: &str) -> Result<(), 
 }
 
 /// Removes a file, a link (not what it points to) or a directory, if it is there.
-fn remove(path: &Path) -> Result<(), IoError> {
+///
+/// # Errors
+/// [`IoError::Os`].
+pub fn remove(path: &Path) -> Result<(), IoError> {
     let Ok(found) = path.symlink_metadata() else { return Ok(()) };
     let removed = if found.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
     removed.map_err(IoError::os("remove", path))
@@ -169,6 +175,16 @@ pub fn sha256_file(path: &Path) -> Result<(String, u64), IoError> {
         hash.update(&block[..n]);
         size += n as u64;
     }
+}
+
+/// Keeps freed memory in the process for what is allocated next.
+///
+/// A store is written and read in column buffers of some hundred kilobytes. By default glibc gives each of them back to
+/// the system, which hands it out again page by page: a quarter of the processor time of a recording, measured. It stops
+/// that for sizes up to the largest block that was freed, so one such block, never touched, is enough. Elsewhere this
+/// does nothing.
+pub fn keep_freed_memory() {
+    drop(std::hint::black_box(Vec::<u8>::with_capacity(31 << 20)));
 }
 
 /// Text that came from a file, safe to print on a terminal: control characters are shown escaped.

@@ -2,16 +2,20 @@
 #![expect(clippy::print_stderr, reason = "the face of the program prints")]
 
 mod args;
+mod convert;
 mod estimate_mi;
 mod evaluate;
 mod generate;
 mod inspect;
 mod list;
+mod pairs;
 mod quickstart;
 mod record;
+mod recover;
 mod report;
 mod train;
 mod ui;
+mod verify;
 
 use std::process::ExitCode;
 
@@ -42,6 +46,14 @@ enum Command {
     Record(record::Args),
     /// Show what a recorded store holds
     Inspect(inspect::Args),
+    /// Check everything about a store, and report every fault
+    Verify(verify::Args),
+    /// Put what a killed recording left under its name
+    Recover(recover::Args),
+    /// Write a store in another form: directory, .parquet, .mcap
+    Convert(convert::Args),
+    /// Turn a store into a table with one row per episode, step, sender and receiver
+    Pairs(pairs::Args),
     /// Estimate how much messages and actions, or any columns, tell about each other
     EstimateMi(estimate_mi::Args),
     /// Train a team over a link prior
@@ -63,6 +75,8 @@ pub enum Outcome {
     Done,
     /// Done, and data was lost, which was reported (exit code 3).
     DataLost,
+    /// Done, and the answer is that something is wrong (exit code 1).
+    Wrong,
     /// Interrupted in good order; can be resumed (exit code 4).
     Interrupted,
 }
@@ -79,6 +93,7 @@ pub fn main() -> ExitCode {
     };
     match dispatch(cli.command) {
         Ok(Outcome::Done) => ExitCode::SUCCESS,
+        Ok(Outcome::Wrong) => ExitCode::FAILURE,
         Ok(Outcome::DataLost) => ExitCode::from(3),
         Ok(Outcome::Interrupted) => ExitCode::from(4),
         Err(error) => ui::report_error(&error),
@@ -90,6 +105,10 @@ fn dispatch(command: Command) -> anyhow::Result<Outcome> {
         Command::Quickstart(args) => quickstart::run(&args),
         Command::Record(args) => record::run(&args),
         Command::Inspect(args) => inspect::run(&args),
+        Command::Verify(args) => verify::run(&args),
+        Command::Recover(args) => recover::run(&args),
+        Command::Convert(args) => convert::run(&args),
+        Command::Pairs(args) => pairs::run(&args),
         Command::EstimateMi(args) => estimate_mi::run(&args),
         Command::Train(args) => train::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),

@@ -79,7 +79,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
             "interrupted: removed {}; the same command starts again from the beginning",
             args.out.display()
         )),
-        Outcome::DataLost => {}
+        Outcome::DataLost | Outcome::Wrong => {}
     }
     Ok(outcome)
 }

@@ -3,8 +3,7 @@
 use super::RecordError;
 use crate::registry::Spec;
 use crate::scenario::{Scenario, Scratch, offsets};
-use crate::schema::{Episode, Layout, Matrix};
-use crate::storage::EpisodeSource;
+use crate::schema::{Episode, Layout, Manifest, Matrix};
 
 /// Largest difference that two correct programs may have in a state column, world units.
 pub const STATE_TOLERANCE: f64 = 1e-9;
@@ -44,30 +43,6 @@ impl Difference {
     }
 }
 
-/// Plays every step of a store again: the state and rewards that each recorded state and its actions lead to, and the
-/// observations of every row. The manifest's scenario must be one of this program's. `progress` is told of every
-/// episode. Returns the differences per column: `state`, `observation.*`, `reward`, `reward.*`.
-///
-/// # Errors
-/// [`RecordError::Storage`] when the store cannot be read, [`RecordError::Scenario`] when the manifest's scenario cannot
-/// be built, [`RecordError::Mismatch`] when the store's columns, states or actions are not that scenario's.
-pub fn resimulate(
-    source: &mut dyn EpisodeSource,
-    progress: &mut dyn FnMut(&Episode),
-) -> Result<Vec<Difference>, RecordError> {
-    let named = source.manifest().scenario.clone();
-    let spec: Spec = serde_json::from_value(named).map_err(|e| RecordError::Mismatch(format!("scenario: {e}")))?;
-    let scenario = crate::scenario::build(&spec)?;
-    let layout = source.manifest().layout();
-    check_layout(&*scenario, &layout)?;
-    let mut player = Player::new(scenario, &layout);
-    while let Some(episode) = source.next_episode()? {
-        player.play(&episode)?;
-        progress(&episode);
-    }
-    Ok(player.differences())
-}
-
 /// Compares the columns of a store with those of its scenario; messages may be of any width.
 fn check_layout(scenario: &dyn Scenario, layout: &Layout) -> Result<(), RecordError> {
     let fail = |message: String| Err(RecordError::Mismatch(message));
@@ -96,7 +71,9 @@ fn check_layout(scenario: &dyn Scenario, layout: &Layout) -> Result<(), RecordEr
     Ok(())
 }
 
-struct Player {
+/// A store's episodes played again: the state and rewards that each recorded state and its actions lead to, and the
+/// observations of every row, compared with what is recorded.
+pub struct Resimulation {
     scenario: Box<dyn Scenario>,
     scratch: Scratch,
     state: Difference,
@@ -107,12 +84,26 @@ struct Player {
     observation_offsets: Vec<usize>,
 }
 
-impl Player {
-    fn new(scenario: Box<dyn Scenario>, layout: &Layout) -> Self {
+impl std::fmt::Debug for Resimulation {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Resimulation").field("scenario", &self.scenario.parameters()).finish_non_exhaustive()
+    }
+}
+
+impl Resimulation {
+    /// Builds the scenario that a store's manifest names; its columns must be the store's.
+    ///
+    /// # Errors
+    /// [`RecordError::Scenario`] when it cannot be built, [`RecordError::Mismatch`] when its columns are others.
+    pub fn of(manifest: &Manifest) -> Result<Self, RecordError> {
+        let named = manifest.scenario.clone();
+        let spec: Spec = serde_json::from_value(named).map_err(|e| RecordError::Mismatch(format!("scenario: {e}")))?;
+        let (scenario, layout) = (crate::scenario::build(&spec)?, manifest.layout());
+        check_layout(&*scenario, &layout)?;
         let column = |column: String, tolerance| Difference { column, largest: 0.0, tolerance, episode: 0, step: 0 };
         let named =
             |kind: &str| layout.agents.iter().map(|a| column(format!("{kind}.{}", a.name), FLOAT_TOLERANCE)).collect();
-        Self {
+        Ok(Self {
             scratch: Scratch::default(),
             state: column("state".to_owned(), STATE_TOLERANCE),
             observations: named("observation"),
@@ -120,15 +111,20 @@ impl Player {
             rewards: named("reward"),
             observation_offsets: offsets(scenario.agents(), |a| a.observation),
             scenario,
-        }
+        })
     }
 
-    fn differences(self) -> Vec<Difference> {
+    /// The differences so far, per column: `state`, `observation.*`, `reward`, `reward.*`.
+    pub fn differences(self) -> Vec<Difference> {
         let all = std::iter::once(self.state).chain(self.observations);
         all.chain(std::iter::once(self.reward)).chain(self.rewards).collect()
     }
 
-    fn play(&mut self, e: &Episode) -> Result<(), RecordError> {
+    /// Plays an episode of the store again, step by step, each from its recorded state.
+    ///
+    /// # Errors
+    /// [`RecordError::Mismatch`] for a state or an action that the scenario cannot have.
+    pub fn play(&mut self, e: &Episode) -> Result<(), RecordError> {
         let (scenario, width) = (&*self.scenario, self.scenario.shape().width());
         let at = |step: usize, message: &str| format!("episode {} step {step}: {message}", e.index);
         let mut seen = vec![0.0; self.observation_offsets[e.observations.len()]];

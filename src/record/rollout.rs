@@ -1,7 +1,6 @@
 //! Episodes: each a pure function of the seed and its number; computed in parallel, stored in order.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::sync_channel;
 
 use rayon::iter::{IntoParallelIterator as _, ParallelIterator as _};
 
@@ -71,7 +70,8 @@ impl Recording<'_> {
     pub fn manifest(&self) -> Manifest {
         let [scenario, link, policy] =
             [self.scenario.parameters(), self.link.parameters(), self.policy.parameters()].map(Into::into);
-        Manifest::new(self.seed, scenario, link, policy, &self.layout())
+        let manifest = Manifest::new(self.seed, scenario, link, policy, &self.layout());
+        Manifest { planned: self.episodes, ..manifest }
     }
 
     /// Episode number `index`: the same for the same seed, whoever asks and in whatever order.
@@ -123,8 +123,8 @@ impl Recording<'_> {
         episode
     }
 
-    /// Computes all episodes in blocks, in parallel, and appends them in order. The sink is called from this thread
-    /// while the next block is computed. `committed` is told of every episode once it survives a kill; when `stop`
+    /// Computes all episodes in blocks, in parallel, and appends them in order, while the next block is computed, from
+    /// a thread of the pool. `committed` is told of every episode once it survives a kill; when `stop`
     /// turns true the recording ends after the block at hand.
     ///
     /// # Errors
@@ -145,32 +145,23 @@ impl Recording<'_> {
             .build()
             .map_err(|e| RecordError::Threads { threads, reason: e.to_string() })?;
         let layout = self.layout();
-        let block = if options.block == 0 { default_block(&layout, self.scenario.steps()) } else { options.block };
+        let size = if options.block == 0 { default_block(&layout, self.scenario.steps()) } else { options.block };
+        let compute = |first: u64| -> Vec<Episode> {
+            let end = if stop.load(Ordering::Relaxed) { first } else { first.saturating_add(size as u64) };
+            (first..end.min(self.episodes)).into_par_iter().map(|i| self.episode_of(&layout, i)).collect()
+        };
         let mut done = 0;
-        std::thread::scope(|scope| {
-            let (send, receive) = sync_channel::<Vec<Episode>>(0);
-            let (layout, pool) = (&layout, &pool);
-            scope.spawn(move || {
-                let mut next = 0;
-                while next < self.episodes && !stop.load(Ordering::Relaxed) {
-                    let end = self.episodes.min(next.saturating_add(block as u64));
-                    let compute = || (next..end).into_par_iter().map(|i| self.episode_of(layout, i)).collect();
-                    if send.send(pool.install(compute)).is_err() {
-                        return; // the sink has failed
-                    }
-                    next = end;
-                }
-            });
-            for block in receive {
-                if stop.load(Ordering::Relaxed) {
-                    break;
-                }
-                block.iter().try_for_each(|episode| sink.append(episode))?;
-                done = sink.commit()?;
-                block.iter().for_each(&mut *committed);
-            }
-            Ok(Recorded { episodes: done, interrupted: done < self.episodes })
-        })
+        let mut block = pool.install(|| compute(0));
+        while !block.is_empty() && !stop.load(Ordering::Relaxed) {
+            let next = done + block.len() as u64;
+            let append = || sink.append_all(&block).and_then(|()| sink.commit());
+            // both halves split into small tasks, so that no thread waits for the other half
+            let (appended, computed) = pool.install(|| rayon::join(append, || compute(next)));
+            done = appended?;
+            block.iter().for_each(&mut *committed);
+            block = computed;
+        }
+        Ok(Recorded { episodes: done, interrupted: done < self.episodes })
     }
 }
 

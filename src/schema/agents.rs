@@ -49,6 +49,8 @@ impl Layout {
     pub const MAX_AGENTS: usize = 4096;
     /// Widest column that any reader accepts.
     pub const MAX_WIDTH: usize = 1 << 20;
+    /// Most bytes that a row holds, and so the least memory a reader needs.
+    pub const MAX_ROW_BYTES: usize = 48 << 20;
 
     /// Indices of the communicators, in order: the rows and columns of the link matrix.
     pub fn communicators(&self) -> Vec<usize> {
@@ -89,6 +91,11 @@ impl Layout {
             if agent.observation.max(agent.message).max(agent.action) > Self::MAX_WIDTH {
                 return fail(format!("agent {name}: a column is wider than {}", Self::MAX_WIDTH));
             }
+        }
+        let agents: usize = self.agents.iter().map(|a| 4 * (a.observation + a.message + a.action + 1)).sum();
+        let row = 8 * self.state_fields.len() + self.communicators().len().pow(2) + agents;
+        if row > Self::MAX_ROW_BYTES {
+            return fail(format!("a row of {row} bytes is over the limit of {}", Self::MAX_ROW_BYTES));
         }
         Ok(())
     }

@@ -39,6 +39,9 @@ pub struct Manifest {
     pub episodes: u64,
     /// Steps (rows with an action) in the store.
     pub steps: u64,
+    /// Episodes that were to be recorded, while they are not all there; 0 in a complete store, or when nobody knew.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub planned: u64,
     /// Scenario name, profile and every constant.
     pub scenario: Value,
     /// Link prior and its parameters.
@@ -70,6 +73,7 @@ impl Manifest {
             seed,
             episodes: 0,
             steps: 0,
+            planned: 0,
             scenario,
             link,
             policy,
@@ -84,6 +88,14 @@ impl Manifest {
     /// The shape of its episodes.
     pub fn layout(&self) -> Layout {
         Layout { agents: self.agents.clone(), state_fields: self.state_fields.clone() }
+    }
+
+    /// The manifest of a recording of the same episodes that is about to start.
+    #[must_use]
+    pub fn unsealed(&self) -> Self {
+        let planned = if self.planned == 0 { self.episodes } else { self.planned };
+        let (content, parts, self_sha256) = (String::new(), Vec::new(), String::new());
+        Self { episodes: 0, steps: 0, planned, content, parts, self_sha256, ..self.clone() }
     }
 
     /// The JSON text with `self_sha256` filled in.
@@ -106,6 +118,28 @@ impl Manifest {
     /// # Errors
     /// [`SchemaError::Version`] for a newer schema, [`SchemaError::Manifest`] for anything else.
     pub fn parse(text: &str) -> Result<Self, SchemaError> {
+        let manifest = Self::read(text)?;
+        let zeroed = text.replacen(&manifest.self_sha256, SELF_SHA256_PLACEHOLDER, 1);
+        let digest = hex(&Sha256::digest(zeroed.as_bytes()));
+        if manifest.self_sha256.len() != 64 || manifest.self_sha256 != digest {
+            let message = "self_sha256 does not match its text: the manifest was changed or damaged";
+            return Err(SchemaError::Manifest(message.to_owned()));
+        }
+        manifest.check()?;
+        Ok(manifest)
+    }
+
+    /// Reads a manifest whose `self_sha256` may be wrong, to say more about a damaged store; everything else is checked.
+    ///
+    /// # Errors
+    /// As [`Manifest::parse`], but for the digest.
+    pub fn parse_damaged(text: &str) -> Result<Self, SchemaError> {
+        let manifest = Self::read(text)?;
+        manifest.check()?;
+        Ok(manifest)
+    }
+
+    fn read(text: &str) -> Result<Self, SchemaError> {
         #[derive(Deserialize)]
         struct VersionOnly {
             schema_version: u32,
@@ -115,17 +149,17 @@ impl Manifest {
         if version.schema_version > SCHEMA_VERSION {
             return Err(SchemaError::Version { found: version.schema_version });
         }
-        let manifest: Self = serde_json::from_str(text).map_err(|e| fail(e.to_string()))?;
-        let zeroed = text.replacen(&manifest.self_sha256, SELF_SHA256_PLACEHOLDER, 1);
-        let digest = hex(&Sha256::digest(zeroed.as_bytes()));
-        if manifest.self_sha256.len() != 64 || manifest.self_sha256 != digest {
-            return Err(fail("self_sha256 does not match its text: the manifest was changed or damaged".to_owned()));
+        serde_json::from_str(text).map_err(|e| fail(e.to_string()))
+    }
+
+    /// Kind, layout and part names.
+    fn check(&self) -> Result<(), SchemaError> {
+        let fail = |m: String| SchemaError::Manifest(m);
+        if self.kind != "rollouts" {
+            return Err(fail(format!("kind: expected \"rollouts\", found {:?}", self.kind)));
         }
-        if manifest.kind != "rollouts" {
-            return Err(fail(format!("kind: expected \"rollouts\", found {:?}", manifest.kind)));
-        }
-        manifest.layout().check()?;
-        for part in &manifest.parts {
+        self.layout().check()?;
+        for part in &self.parts {
             let bare = !part.file.is_empty()
                 && part.file.len() <= 255
                 && !part.file.starts_with('.')
@@ -134,8 +168,13 @@ impl Manifest {
                 return Err(fail(format!("part name {:?} is not a plain file name inside the store", part.file)));
             }
         }
-        Ok(manifest)
+        Ok(())
     }
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "the signature that serde asks for")]
+fn is_zero(value: &u64) -> bool {
+    *value == 0
 }
 
 /// Lower-case hex of a digest.

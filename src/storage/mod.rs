@@ -2,16 +2,28 @@
 //!
 //! Adding a format: write `storage/<name>.rs` with an `ENTRY`, and add `mod <name>;` and `<name>::ENTRY,` below.
 
+mod convert;
+mod lock;
 mod mcap;
 mod parquet;
+mod recover;
 mod tally;
+mod verify;
 
 use std::path::{Path, PathBuf};
+
+pub use parquet::PairsWriter;
 
 use crate::io::IoError;
 use crate::registry::Entry;
 use crate::schema::{Episode, Manifest, SchemaError};
 use tally::Tally;
+use verify::Findings;
+
+pub use convert::convert;
+pub use lock::Owner;
+pub use recover::{Recovered, recover};
+pub use verify::{Problem, Report, Watch, verify};
 
 /// All formats, in the order in which a path is offered to them; the last takes what none claims.
 pub const FORMATS: &[Entry<Format>] = &[mcap::ENTRY, parquet::ENTRY];
@@ -19,8 +31,20 @@ pub const FORMATS: &[Entry<Format>] = &[mcap::ENTRY, parquet::ENTRY];
 /// Largest manifest that is read, bytes.
 const MANIFEST_LIMIT: u64 = 64 << 20;
 
-/// Starts a store at a path, for a manifest, with or without `force`.
-pub type Create = fn(&Path, &Manifest, bool) -> Result<Box<dyn EpisodeSink>, StorageError>;
+/// Metadata key of a table of pairs.
+const PAIRS_KEY: &str = "ccmarl.pairs";
+
+/// Starts a store at a path, for a manifest.
+pub type Create = fn(&Path, &Manifest, Options) -> Result<Box<dyn EpisodeSink>, StorageError>;
+
+/// How a store is written.
+#[derive(Clone, Copy, Debug)]
+pub struct Options {
+    /// Replace what ccmarl wrote under this name before.
+    pub force: bool,
+    /// Also write what viewers draw, where the format has viewers; the rollouts do not depend on it.
+    pub viewer: bool,
+}
 
 /// How a format is recognised, written and read.
 #[derive(Clone, Copy, Debug)]
@@ -31,6 +55,10 @@ pub struct Format {
     pub create: Create,
     /// Opens a store for reading; checks its manifest and digests.
     pub open: fn(&Path) -> Result<Box<dyn EpisodeSource>, StorageError>,
+    /// Opens what a kill left of a store: its whole episodes, then an error that says why there are no more.
+    salvage: fn(&Path) -> Result<Box<dyn EpisodeSource>, StorageError>,
+    /// Reports everything that is wrong with a store that the reader refused.
+    diagnose: fn(&Path, &mut Findings<'_>) -> Result<(), StorageError>,
 }
 
 /// Takes episodes in index order and seals them into a store.
@@ -42,6 +70,14 @@ pub trait EpisodeSink: Send {
     /// # Errors
     /// [`StorageError`] when the episode is out of order, breaks the schema or holds a NaN, or the disk refuses.
     fn append(&mut self, episode: &Episode) -> Result<(), StorageError>;
+
+    /// Appends the next episodes; a sink that can works on them with all threads of the caller's pool.
+    ///
+    /// # Errors
+    /// As [`EpisodeSink::append`].
+    fn append_all(&mut self, episodes: &[Episode]) -> Result<(), StorageError> {
+        episodes.iter().try_for_each(|episode| self.append(episode))
+    }
 
     /// Hands all episodes appended so far to the operating system: once this returns they survive the death of the
     /// process. Returns how many these are. Costs one write; call it per batch of episodes.
@@ -67,6 +103,20 @@ pub trait EpisodeSource: Send {
     /// # Errors
     /// [`StorageError`] when data is damaged, missing or against the schema.
     fn next_episode(&mut self) -> Result<Option<Episode>, StorageError>;
+
+    /// Goes on to episode number `episode` without returning those before. A directory passes over whole parts without
+    /// opening them.
+    ///
+    /// # Errors
+    /// As [`EpisodeSource::next_episode`].
+    fn skip_to(&mut self, episode: u64) -> Result<(), StorageError> {
+        for _ in 0..episode {
+            if self.next_episode()?.is_none() {
+                break;
+            }
+        }
+        Ok(())
+    }
 }
 
 /// What goes wrong with a store. The path comes last.
@@ -99,6 +149,36 @@ pub enum StorageError {
         /// Where.
         path: PathBuf,
     },
+    /// Somebody is writing it.
+    #[error("{owner} is writing it right now: wait until it has ended, or give another --out: {}", path.display())]
+    Busy {
+        /// Who.
+        owner: Owner,
+        /// What is being written.
+        path: PathBuf,
+    },
+    /// What is left of a recording that did not finish.
+    #[error(
+        "its recording did not finish; `ccmarl recover {}` puts its whole episodes in place, --force records anew: {}",
+        printable(target), path.display()
+    )]
+    Unfinished {
+        /// The store's name.
+        target: PathBuf,
+        /// The hidden `.partial` beside it.
+        path: PathBuf,
+    },
+    /// An output name that asks for a form which there is not.
+    #[error(
+        "no store ends in .{extension}: give a name in .parquet or .mcap, one without an ending for a directory, or one that ends in / for a directory of just this name: {}",
+        path.display()
+    )]
+    Extension {
+        /// The ending.
+        extension: String,
+        /// The name.
+        path: PathBuf,
+    },
     /// A digest or a structure does not match.
     #[error("damaged: {message}: {}", path.display())]
     Damaged {
@@ -109,14 +189,24 @@ pub enum StorageError {
     },
 }
 
-/// Starts a store at `path`; its extension chooses the format (`.mcap`, `.parquet`, anything else a directory of
-/// Parquet parts).
+/// Starts a store at `path`, with what viewers draw; its extension chooses the format (`.mcap`, `.parquet`, anything
+/// else a directory of Parquet parts).
 ///
 /// # Errors
 /// [`IoError::Exists`] without `force`; [`StorageError`] when the disk refuses.
 pub fn create(path: &Path, manifest: &Manifest, force: bool) -> Result<Box<dyn EpisodeSink>, StorageError> {
-    crate::io::refuse_existing(path, force)?;
-    (format_of(path).build.create)(path, manifest, force)
+    create_with(path, manifest, Options { force, viewer: true })
+}
+
+/// Starts a store at `path`, as [`create`] does, with options.
+///
+/// # Errors
+/// As [`create`].
+pub fn create_with(path: &Path, manifest: &Manifest, options: Options) -> Result<Box<dyn EpisodeSink>, StorageError> {
+    check_name(path)?;
+    crate::io::refuse_existing(path, options.force)?;
+    crate::io::keep_freed_memory();
+    (format_of(path).build.create)(path, manifest, options)
 }
 
 /// Opens the store at `path`.
@@ -124,13 +214,13 @@ pub fn create(path: &Path, manifest: &Manifest, force: bool) -> Result<Box<dyn E
 /// # Errors
 /// [`StorageError`] when it is missing, not a store, of a newer version, or damaged.
 pub fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
+    if let Some((path, target)) = recover::unfinished(path) {
+        return Err(StorageError::Unfinished { target, path });
+    }
     if !path.exists() {
-        if crate::io::partial_path(path).exists() {
-            let message = "its recording did not finish (what there is of it is in the hidden .partial beside it): record again with --force";
-            return Err(StorageError::NotAStore { message: message.to_owned(), path: path.to_owned() });
-        }
         return Err(IoError::Missing(path.to_owned()).into());
     }
+    crate::io::keep_freed_memory();
     let source = (format_of(path).build.open)(path)?;
     if source.manifest().episodes == 0 {
         let message = "it holds zero episodes: record again".to_owned();
@@ -139,26 +229,41 @@ pub fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
     Ok(source)
 }
 
-/// Where a store is built: checks that `path` and its `.partial` sibling may be replaced, removes an old sibling, makes
-/// the directories above. With `force`, only empty directories and what ccmarl made are replaced.
-fn start_partial(path: &Path, force: bool) -> Result<PathBuf, IoError> {
+/// Refuses a name whose ending looks like that of another kind of file. A number is no such ending (`dropout-0.2`), and
+/// a name that ends in a slash, or is a directory already, is a directory's.
+fn check_name(path: &Path) -> Result<(), StorageError> {
+    let Some(extension) = path.extension() else { return Ok(()) };
+    let extension = extension.to_string_lossy().into_owned();
+    let known = ["parquet", "mcap"].iter().any(|known| extension.eq_ignore_ascii_case(known));
+    let number = extension.starts_with(|c: char| c.is_ascii_digit());
+    if known || number || path.as_os_str().as_encoded_bytes().ends_with(b"/") || path.is_dir() {
+        return Ok(());
+    }
+    Err(StorageError::Extension { extension, path: path.to_owned() })
+}
+
+/// Where a store is built: checks that `path` and its `.partial` sibling may be replaced and that nobody writes there,
+/// removes an old sibling, makes the directories above. With `force`, only empty directories and what ccmarl made are
+/// replaced.
+fn start_partial(path: &Path, force: bool) -> Result<PathBuf, StorageError> {
     crate::io::refuse_existing(path, force)?;
     if path.symlink_metadata().is_ok() && !is_ours(path)? {
-        return Err(IoError::Foreign(path.to_owned()));
+        return Err(IoError::Foreign(path.to_owned()).into());
     }
     let partial = crate::io::partial_path(path);
-    crate::io::refuse_existing(&partial, force)?;
-    if partial.is_dir() {
-        std::fs::remove_dir_all(&partial).map_err(IoError::os("remove", &partial))?;
-    } else if partial.symlink_metadata().is_ok() {
-        std::fs::remove_file(&partial).map_err(IoError::os("remove", &partial))?;
+    if partial.symlink_metadata().is_ok() {
+        lock::hold_leftover(&partial)?;
+        if !force {
+            return Err(StorageError::Unfinished { target: path.to_owned(), path: partial });
+        }
+        crate::io::remove(&partial)?;
     }
     crate::io::create_parent(path)?;
     Ok(partial)
 }
 
 /// Whether ccmarl made what stands at `path`: an empty directory or file, one with a rollout manifest, or a file that
-/// carries our metadata key in its last mebibyte.
+/// carries one of our metadata keys in its last mebibyte.
 fn is_ours(path: &Path) -> Result<bool, IoError> {
     use std::io::{Read as _, Seek as _, SeekFrom};
     if path.is_dir() {
@@ -174,11 +279,15 @@ fn is_ours(path: &Path) -> Result<bool, IoError> {
     let mut tail = Vec::new();
     file.seek(SeekFrom::Start(size.saturating_sub(1 << 20))).map_err(IoError::os("read", path))?;
     file.take(1 << 20).read_to_end(&mut tail).map_err(IoError::os("read", path))?;
-    let key = b"ccmarl.manifest";
-    Ok(size == 0 || tail.windows(key.len()).any(|w| w == key))
+    let holds = |key: &str| tail.windows(key.len()).any(|w| w == key.as_bytes());
+    Ok(size == 0 || holds("ccmarl.manifest") || holds(PAIRS_KEY))
 }
 
 /// The first format that claims the path; Parquet when none does.
 fn format_of(path: &Path) -> &'static Entry<Format> {
     FORMATS.iter().find(|e| (e.build.claims)(path)).unwrap_or(&FORMATS[FORMATS.len() - 1])
+}
+
+fn printable(path: &Path) -> String {
+    crate::io::printable(&path.display().to_string())
 }

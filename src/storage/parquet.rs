@@ -27,13 +27,21 @@
 
 mod columns;
 mod decoder;
+mod diagnose;
 mod encoder;
+mod group;
+mod journal;
+mod pages;
+mod pairs;
+mod salvage;
 mod sink;
 mod source;
 
 use std::path::Path;
 
-use super::{EpisodeSink, EpisodeSource, Format, StorageError};
+pub use pairs::PairsWriter;
+
+use super::{EpisodeSink, EpisodeSource, Format, Options, StorageError};
 use crate::registry::Entry;
 use crate::schema::Manifest;
 
@@ -52,7 +60,7 @@ pub(super) const ENTRY: Entry<Format> = Entry {
     summary: "a directory of Parquet parts with a manifest, or one .parquet file",
     reference: "Apache Parquet",
     value: None,
-    build: Format { claims, create, open },
+    build: Format { claims, create, open, salvage, diagnose: diagnose::diagnose },
 };
 
 fn claims(path: &Path) -> bool {
@@ -63,8 +71,8 @@ fn is_single(path: &Path) -> bool {
     path.extension().is_some_and(|e| e.eq_ignore_ascii_case("parquet"))
 }
 
-fn create(path: &Path, manifest: &Manifest, force: bool) -> Result<Box<dyn EpisodeSink>, StorageError> {
-    Ok(Box::new(sink::ParquetSink::create(path, manifest, force)?))
+fn create(path: &Path, manifest: &Manifest, options: Options) -> Result<Box<dyn EpisodeSink>, StorageError> {
+    Ok(Box::new(sink::ParquetSink::create(path, manifest, options.force)?))
 }
 
 fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
@@ -77,6 +85,10 @@ fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
             "expected a directory, a .parquet or a .mcap file; for a table use `ccmarl estimate-mi FILE --x … --y …`";
         Err(StorageError::NotAStore { message: message.to_owned(), path: path.to_owned() })
     }
+}
+
+fn salvage(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
+    Ok(Box::new(salvage::Leftover::open(path)?))
 }
 
 /// Where the 64 digits of the file's own digest begin in the end of its footer: after the key stand two bytes of

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use ccmarl::link::{Setting, build as build_link};
-use ccmarl::record::{EpisodeReturn, RecordError, Recording, build_policy, resimulate, returns};
+use ccmarl::record::{Difference, EpisodeReturn, RecordError, Recording, Resimulation, build_policy, returns};
 use ccmarl::registry::Spec;
 use ccmarl::rng::{Seeds, Stream, uniform};
 use ccmarl::scenario::{SCENARIOS, Scenario, Scratch, Worlds, build};
@@ -131,6 +131,15 @@ fn resolved_parameters_build_the_same_scenario_and_wrong_ones_are_refused() {
     assert!(absent.iter().all(|s| s.parameters()["view_radius"] == "none"));
 }
 
+/// Plays a store again.
+fn resimulate(source: &mut dyn EpisodeSource) -> Result<Vec<Difference>, RecordError> {
+    let mut again = Resimulation::of(source.manifest())?;
+    while let Some(episode) = source.next_episode()? {
+        again.play(&episode)?;
+    }
+    Ok(again.differences())
+}
+
 /// The stores of `datasets/golden/mpe2`, sorted.
 fn golden() -> Vec<std::path::PathBuf> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("datasets/golden/mpe2");
@@ -145,12 +154,11 @@ fn profile_mpe2_equals_mpe2() {
     let stores = golden();
     assert_eq!(stores.len(), 28);
     for path in stores {
-        let mut steps = 0;
         let mut source = ccmarl::storage::open(&path).unwrap();
-        for column in resimulate(source.as_mut(), &mut |e| steps += e.steps).unwrap() {
+        assert!(source.manifest().steps >= 50);
+        for column in resimulate(source.as_mut()).unwrap() {
             assert!(column.holds(), "{}: {column:?}", path.display());
         }
-        assert!(steps >= 50);
     }
 }
 
@@ -179,7 +187,7 @@ fn held(spec: &Spec) -> Held {
 #[test]
 fn recorded_episodes_resimulate_exactly() {
     for spec in every_kind(4) {
-        let differences = resimulate(&mut held(&spec), &mut |_| ()).unwrap();
+        let differences = resimulate(&mut held(&spec)).unwrap();
         assert!(differences.iter().all(|d| d.largest == 0.0), "{spec}: {differences:?}");
     }
 }
@@ -190,7 +198,7 @@ fn a_changed_value_shows_in_its_column_and_place() {
     let changed = |change: &dyn Fn(&mut Episode)| {
         let mut store = held(&spec);
         change(&mut store.1[0]);
-        let all = resimulate(&mut store, &mut |_| ()).unwrap();
+        let all = resimulate(&mut store).unwrap();
         let wrong: Vec<_> = all.into_iter().filter(|d| !d.holds()).map(|d| (d.column, d.step)).collect();
         wrong
     };
@@ -208,7 +216,7 @@ fn a_store_of_another_scenario_is_refused_with_its_reason() {
     let error = |change: &dyn Fn(&mut Held)| {
         let mut store = held(&Spec::new("simple_reference").with("profile", "mpe2").with("discrete", true));
         change(&mut store);
-        resimulate(&mut store, &mut |_| ()).unwrap_err()
+        resimulate(&mut store).unwrap_err()
     };
     let text = |change: &dyn Fn(&mut Held)| match error(change) {
         RecordError::Mismatch(message) => message,
@@ -419,4 +427,36 @@ fn profile_paper_earns_what_an_independent_simulation_earns() {
         // one comparison in 16,000 fails by chance at four standard errors
         assert!((mean - expected).abs() < 4.0 * error.hypot(its_error), "{spec} {policy}: {mean} ± {error}");
     }
+}
+
+/// Exit code and stdout of `ccmarl verify STORE --resimulate`.
+fn verify(store: &Path) -> (i32, String) {
+    let mut command = assert_cmd::Command::new(env!("CARGO_BIN_EXE_ccmarl"));
+    let output = command.arg("verify").arg(store).arg("--resimulate").output().unwrap();
+    (output.status.code().unwrap(), String::from_utf8(output.stdout).unwrap())
+}
+
+#[test]
+fn the_command_resimulates_stores_of_other_programs_and_tells_a_wrong_constant() {
+    let golden = golden().into_iter().find(|p| p.ends_with("reference-discrete")).unwrap();
+    let (code, text) = verify(&golden);
+    assert_eq!(code, 0, "{text}");
+    assert!(text.contains("reward.agent_1") && text.contains("1e-9"), "{text}");
+
+    let dir = tempfile::tempdir().unwrap();
+    let store = held(&Spec::new("simple_spread"));
+    let wrong = |name: &str, scenario: Value| {
+        let path = dir.path().join(name);
+        let manifest = Manifest { scenario, ..store.0.clone() };
+        let mut sink = ccmarl::storage::create(&path, &manifest, false).unwrap();
+        sink.append(&store.1[0]).unwrap();
+        sink.finish().unwrap();
+        let (code, text) = verify(&path);
+        assert_eq!(code, 1, "{text}");
+        text
+    };
+    let slow = wrong("slow", serde_json::json!({"name": "simple_spread", "dt": 0.05}));
+    assert!(slow.contains("resimulation") && slow.contains("allowed is 1e-9"), "{slow}");
+    let other = wrong("other", serde_json::json!({"name": "simple_tag"}));
+    assert!(other.contains("state_fields: the scenario has 20, the store 18"), "{other}");
 }

@@ -1,52 +1,58 @@
 //! Reading: first all checksums and the manifest, then the episodes, chunk by chunk.
 
 use std::fs::File;
-use std::io::Read as _;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use mcap::records::{Record, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::{MAGIC, McapError, parse_record};
-use prost::Message as _;
 
-use super::{EPISODE_TOPIC, JSON_KEY, MANIFEST_RECORD, STEP_TOPIC, proto};
+use super::assembler::{Assembler, Channels};
+use super::{JSON_KEY, MANIFEST_RECORD, RECORDING_RECORD};
 use crate::io::IoError;
-use crate::schema::{Episode, Layout, Manifest};
+use crate::schema::{Episode, Manifest};
 use crate::storage::{EpisodeSource, StorageError, Tally};
 
 /// Longest record that is read, bytes. With no limit one flipped bit can ask for any amount of memory.
 const RECORD_LIMIT: usize = 64 << 20;
 
-/// Records of a file, one after the other.
-struct Records {
-    file: File,
+/// Records of a file, or of one chunk, one after the other.
+pub(super) struct Records<R> {
+    input: R,
     path: PathBuf,
     reader: LinearReader,
 }
 
 /// Why the records ended.
-enum Stop {
+pub(super) enum Stop {
     /// The file ends within a record.
     Short,
     /// Anything else.
     Error(StorageError),
 }
 
-impl Records {
-    fn open(path: &Path, options: LinearReaderOptions) -> Result<Self, StorageError> {
+impl Records<File> {
+    pub(super) fn open(path: &Path, options: LinearReaderOptions) -> Result<Self, StorageError> {
         let file = File::open(path).map_err(IoError::os("open", path))?;
+        Ok(Self::new(file, path, options))
+    }
+}
+
+impl<R: Read> Records<R> {
+    pub(super) fn new(input: R, path: &Path, options: LinearReaderOptions) -> Self {
         let options = options.with_record_length_limit(RECORD_LIMIT);
-        Ok(Self { file, path: path.to_owned(), reader: LinearReader::new_with_options(options) })
+        Self { input, path: path.to_owned(), reader: LinearReader::new_with_options(options) }
     }
 
     /// Calls `take` with records (opcode, body) until it returns true; false at the end of the file.
-    fn each(&mut self, mut take: impl FnMut(u8, &[u8]) -> Result<bool, String>) -> Result<bool, Stop> {
+    pub(super) fn each(&mut self, mut take: impl FnMut(u8, &[u8]) -> Result<bool, String>) -> Result<bool, Stop> {
         let damaged = |message: String| Stop::Error(StorageError::Damaged { message, path: self.path.clone() });
         while let Some(event) = self.reader.next_event() {
             match event {
                 Ok(LinearReadEvent::ReadRequest(need)) => {
                     let slot = self.reader.insert(need.clamp(1 << 16, 1 << 20));
-                    let read = self.file.read(slot).map_err(IoError::os("read", &self.path));
+                    let read = self.input.read(slot).map_err(IoError::os("read", &self.path));
                     self.reader.notify_read(read.map_err(|e| Stop::Error(e.into()))?);
                 }
                 Ok(LinearReadEvent::Record { data, opcode }) => {
@@ -62,71 +68,64 @@ impl Records {
     }
 }
 
-/// The channels of a file that matter here, by id.
-#[derive(Default)]
-struct Channels {
-    step: Vec<u16>,
-    episode: Vec<u16>,
-}
-
-impl Channels {
-    fn add(&mut self, body: &[u8]) -> Result<(), String> {
-        if let Record::Channel(channel) = parse_record(op::CHANNEL, body).map_err(|e| e.to_string())? {
-            let list = match channel.topic.as_str() {
-                STEP_TOPIC => &mut self.step,
-                EPISODE_TOPIC => &mut self.episode,
-                _ => return Ok(()),
-            };
-            if channel.message_encoding != "protobuf" {
-                return Err(format!("topic {}: expected protobuf, found {}", channel.topic, channel.message_encoding));
-            }
-            if !list.contains(&channel.id) {
-                list.push(channel.id);
-            }
-        }
-        Ok(())
-    }
-}
-
 /// A store open for reading.
 pub(super) struct McapSource {
     path: PathBuf,
     manifest: Manifest,
-    layout: Layout,
-    records: Option<Records>,
-    channels: Channels,
-    /// Bytes that an encoded row has at most.
-    row_limit: usize,
+    records: Option<Records<File>>,
+    assembler: Assembler,
     total: Tally,
 }
 
 impl McapSource {
     /// Checks the checksums of the file and its manifest.
     pub(super) fn open(path: &Path) -> Result<Self, StorageError> {
-        let not = |message: &str| StorageError::NotAStore { message: message.to_owned(), path: path.to_owned() };
-        let mut magic = [0; 8];
-        let mut file = File::open(path).map_err(IoError::os("open", path))?;
-        if file.read_exact(&mut magic).is_err() || magic != *MAGIC {
-            return Err(not("it does not begin as an MCAP file"));
-        }
-        let text = match scan(path) {
-            Ok(text) => text.ok_or_else(|| not("an MCAP file without a metadata record ccmarl.manifest"))?,
+        check_magic(path)?;
+        let options = LinearReaderOptions::default()
+            .with_validate_data_section_crc(true)
+            .with_validate_summary_section_crc(true)
+            .with_check_finishes_after_end_magic(true);
+        let found = match scan(path, options, &mut |_, _, _| {}) {
+            Ok(found) => found,
             Err(Stop::Short) => {
                 return Err(StorageError::Truncated { episodes: count_episodes(path)?, path: path.to_owned() });
             }
             Err(Stop::Error(error)) => return Err(error),
         };
+        let Some(text) = found.manifest else {
+            let message = format!("an MCAP file without a metadata record {MANIFEST_RECORD}");
+            return Err(StorageError::NotAStore { message, path: path.to_owned() });
+        };
         let schema = |source| StorageError::Schema { source, path: path.to_owned() };
         let manifest = Manifest::parse(&text).map_err(schema)?;
-        let layout = manifest.layout();
-        let n = layout.communicators().len();
-        let agents: usize =
-            layout.agents.iter().map(|a| 4 * (a.observation + a.message + a.action) + a.name.len() + 64).sum();
-        let row_limit = 128 + 8 * layout.state_fields.len() + n * n + agents;
-        let options = LinearReaderOptions::default().with_prevalidate_chunk_crcs(true);
-        let records = Some(Records::open(path, options)?);
-        let (channels, total) = (Channels::default(), Tally::default());
-        Ok(Self { path: path.to_owned(), manifest, layout, records, channels, row_limit, total })
+        Self::start(path, manifest, LinearReaderOptions::default())
+    }
+
+    /// What a kill left, or a file that was cut short: its whole episodes, then an error that says what is wrong. The
+    /// manifest is the one from before the recording.
+    pub(super) fn salvage(path: &Path) -> Result<Self, StorageError> {
+        check_magic(path)?;
+        let options = LinearReaderOptions::default().with_skip_end_magic(true);
+        let mut text = None;
+        let found = Records::open(path, options)?.each(|opcode, body| {
+            text = metadata(opcode, body, RECORDING_RECORD)?;
+            Ok(text.is_some())
+        });
+        let schema = |source| StorageError::Schema { source, path: path.to_owned() };
+        match (text, found) {
+            (Some(text), _) => {
+                let manifest = Manifest::parse(&text).map_err(schema)?.unsealed();
+                Self::start(path, manifest, LinearReaderOptions::default().with_skip_end_magic(true))
+            }
+            (None, Err(Stop::Error(error))) => Err(error),
+            (None, _) => Err(StorageError::Truncated { episodes: 0, path: path.to_owned() }),
+        }
+    }
+
+    fn start(path: &Path, manifest: Manifest, options: LinearReaderOptions) -> Result<Self, StorageError> {
+        let records = Records::open(path, options.with_prevalidate_chunk_crcs(true))?;
+        let assembler = Assembler::new(manifest.layout());
+        Ok(Self { path: path.to_owned(), manifest, records: Some(records), assembler, total: Tally::default() })
     }
 }
 
@@ -137,116 +136,84 @@ impl EpisodeSource for McapSource {
 
     fn next_episode(&mut self) -> Result<Option<Episode>, StorageError> {
         let Some(records) = &mut self.records else { return Ok(None) };
-        let (layout, channels, limit) = (&self.layout, &mut self.channels, self.row_limit);
-        let index = self.total.episodes;
-        let mut episode = Episode::with_capacity(layout, index, 0);
-        let (mut rows, mut end) = (0_usize, None);
-        let found = records.each(|opcode, body| {
-            match opcode {
-                op::CHANNEL => channels.add(body)?,
-                op::MESSAGE => {
-                    let record = parse_record(opcode, body).map_err(|e| e.to_string())?;
-                    let Record::Message { header, data } = record else { return Ok(false) };
-                    if channels.step.contains(&header.channel_id) {
-                        if data.len() > limit {
-                            return Err(format!("a row of {} bytes is over the manifest's {limit}", data.len()));
-                        }
-                        let row = proto::Step::decode(&*data).map_err(|e| format!("{STEP_TOPIC}: {e}"))?;
-                        add(layout, &mut episode, &mut rows, row)?;
-                    } else if channels.episode.contains(&header.channel_id) {
-                        end = Some(proto::Episode::decode(&*data).map_err(|e| format!("{EPISODE_TOPIC}: {e}"))?);
-                    }
-                }
-                _ => {}
-            }
-            Ok(end.is_some())
+        let (assembler, mut found) = (&mut self.assembler, None);
+        let read = records.each(|opcode, body| {
+            found = assembler.take(opcode, body)?;
+            Ok(found.is_some())
         });
-        let damaged = |message: String| StorageError::Damaged { message, path: self.path.clone() };
-        match found {
-            Ok(true) => {}
-            Ok(false) if rows == 0 => {
-                self.records = None;
-                self.total.compare(&self.manifest, &self.path)?;
-                return Ok(None);
-            }
-            Ok(false) => return Err(damaged(format!("episode {index} has {rows} rows and no end"))),
+        let (rows, index) = (assembler.rows(), self.total.episodes);
+        match read {
             Err(Stop::Short) => return Err(StorageError::Truncated { episodes: index, path: self.path.clone() }),
             Err(Stop::Error(error)) => return Err(error),
+            Ok(_) => {}
         }
-        let end = end.unwrap_or_default();
-        episode.steps = rows.saturating_sub(1);
-        if end.index != index || end.steps.checked_add(1) != Some(rows as u64) || end.terminal != episode.terminal {
-            let message =
-                format!("episode {index} of {rows} rows: its end says episode {} of {} steps", end.index, end.steps);
-            return Err(damaged(message));
+        if let Some((episode, hash)) = found {
+            self.total.add(&episode, &hash);
+            return Ok(Some(episode));
         }
-        let hash = self.total.check(&self.layout, &episode);
-        let hash = hash.map_err(|source| StorageError::Schema { source, path: self.path.clone() })?;
-        if end.content_hash != hash {
-            return Err(damaged(format!("episode {index} does not have the content hash at its end")));
+        self.records = None;
+        if rows > 0 {
+            let message = format!("episode {index} has {rows} rows and no end");
+            return Err(StorageError::Damaged { message, path: self.path.clone() });
         }
-        self.total.add(&episode, &hash);
-        Ok(Some(episode))
+        if !self.manifest.content.is_empty() {
+            self.total.compare(&self.manifest, &self.path)?;
+        }
+        Ok(None)
     }
 }
 
-/// Appends a row to an episode, after checking it against the layout.
-fn add(layout: &Layout, e: &mut Episode, rows: &mut usize, row: proto::Step) -> Result<(), String> {
-    let r = *rows;
-    if row.episode != e.index || u64::from(row.step) != r as u64 {
-        let (episode, step) = (row.episode, row.step);
-        return Err(format!("expected episode {} step {r}, found episode {episode} step {step}", e.index));
+/// Refuses what does not begin as an MCAP file.
+fn check_magic(path: &Path) -> Result<(), StorageError> {
+    let mut magic = Vec::new();
+    let file = File::open(path).map_err(IoError::os("open", path))?;
+    file.take(MAGIC.len() as u64).read_to_end(&mut magic).map_err(IoError::os("read", path))?;
+    if !MAGIC.starts_with(&magic) {
+        let message = "it does not begin as an MCAP file".to_owned();
+        return Err(StorageError::NotAStore { message, path: path.to_owned() });
     }
-    let place = || format!("episode {} step {r}", e.index);
-    if row.is_first != (r == 0) || (row.is_terminal && !row.is_last) {
-        return Err(format!("{}: is_first, is_last, is_terminal do not fit", place()));
-    }
-    if row.reward.is_some() == row.is_last || row.agents.len() != layout.agents.len() {
-        return Err(format!("{}: rewards or agents do not fit", place()));
-    }
-    for (spec, agent) in layout.agents.iter().zip(&row.agents) {
-        let acts = if row.is_last { 0 } else { spec.action };
-        let widths = [
-            (agent.observation.len(), spec.observation),
-            (agent.message.len(), spec.message),
-            (agent.action.len(), acts),
-        ];
-        if agent.name != spec.name || widths.iter().any(|(a, b)| a != b) || agent.reward.is_some() == row.is_last {
-            return Err(format!("{}: agent {:?} does not fit the manifest's {:?}", place(), agent.name, spec.name));
-        }
-    }
-    let n = layout.communicators().len();
-    if row.state.len() != layout.state_fields.len() || row.link.len() != n * n {
-        return Err(format!("{}: state or link has the wrong length", place()));
-    }
-    e.state.extend(row.state);
-    e.link.extend(row.link);
-    e.reward.extend(row.reward);
-    for (i, agent) in row.agents.into_iter().enumerate() {
-        e.observations[i].data.extend(agent.observation);
-        e.messages[i].data.extend(agent.message);
-        e.actions[i].data.extend(agent.action);
-        e.rewards[i].extend(agent.reward);
-    }
-    e.terminal = row.is_terminal;
-    *rows += 1;
     Ok(())
 }
 
-/// Reads a file from end to end without decoding its chunks: checks the checksums of the data section and of the
-/// summary, and returns the manifest.
-fn scan(path: &Path) -> Result<Option<String>, Stop> {
-    let options = LinearReaderOptions::default()
-        .with_emit_chunks(true)
-        .with_validate_data_section_crc(true)
-        .with_validate_summary_section_crc(true)
-        .with_check_finishes_after_end_magic(true);
-    let mut manifest = None;
-    let mut records = Records::open(path, options).map_err(Stop::Error)?;
+/// The JSON text of the metadata record of this name, if this is it.
+pub(super) fn metadata(opcode: u8, body: &[u8], name: &str) -> Result<Option<String>, String> {
+    if opcode != op::METADATA {
+        return Ok(None);
+    }
+    match parse_record(opcode, body).map_err(|e| e.to_string())? {
+        Record::Metadata(mut m) if m.name == name => Ok(m.metadata.remove(JSON_KEY)),
+        _ => Ok(None),
+    }
+}
+
+/// The manifests of a file.
+#[derive(Default)]
+pub(super) struct Manifests {
+    /// As it was before the recording.
+    pub(super) recording: Option<String>,
+    /// Sealed.
+    pub(super) manifest: Option<String>,
+}
+
+/// Reads a file from end to end without decoding its chunks, checks what `options` ask for, and returns the manifests.
+/// `see` is told of every record: where it begins, its opcode and its body.
+pub(super) fn scan(
+    path: &Path,
+    options: LinearReaderOptions,
+    see: &mut dyn FnMut(u64, u8, &[u8]),
+) -> Result<Manifests, Stop> {
+    let mut found = Manifests::default();
+    let mut at = MAGIC.len() as u64;
+    let mut records = Records::open(path, options.with_emit_chunks(true)).map_err(Stop::Error)?;
     records.each(|opcode, body| {
+        see(at, opcode, body);
+        at += 9 + body.len() as u64; // opcode and length
         match opcode {
-            op::METADATA | op::DATA_END | op::FOOTER => match parse_record(opcode, body).map_err(|e| e.to_string())? {
-                Record::Metadata(mut m) if m.name == MANIFEST_RECORD => manifest = m.metadata.remove(JSON_KEY),
+            op::METADATA => {
+                found.recording = metadata(opcode, body, RECORDING_RECORD)?.or(found.recording.take());
+                found.manifest = metadata(opcode, body, MANIFEST_RECORD)?.or(found.manifest.take());
+            }
+            op::DATA_END | op::FOOTER => match parse_record(opcode, body).map_err(|e| e.to_string())? {
                 Record::DataEnd(end) if end.data_section_crc == 0 => return Err("no checksum of the data".to_owned()),
                 Record::Footer(end) if end.summary_crc == 0 => return Err("no checksum of the summary".to_owned()),
                 _ => {}
@@ -255,7 +222,7 @@ fn scan(path: &Path) -> Result<Option<String>, Stop> {
         }
         Ok(false)
     })?;
-    Ok(manifest)
+    Ok(found)
 }
 
 /// Whole episodes of a file that was cut short.

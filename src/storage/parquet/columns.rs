@@ -16,7 +16,7 @@ use parquet::schema::types::ColumnPath;
 use crate::schema::{AgentSpec, Episode, Layout};
 
 /// Name of the elements of a list, as pyarrow and the Parquet standard write it.
-const ELEMENT: &str = "element";
+pub(super) const ELEMENT: &str = "element";
 
 /// Values that the encoder takes at once; the crate's 1024 costs more calls.
 const WRITE_BATCH: usize = 1 << 16;
@@ -91,6 +91,7 @@ pub(super) fn properties(schema: &Schema) -> WriterProperties {
             DataType::Int32 | DataType::Int64 => builder
                 .set_column_encoding(path.clone(), Encoding::DELTA_BINARY_PACKED)
                 .set_column_statistics_enabled(path, EnabledStatistics::Chunk),
+            DataType::Utf8 => builder.set_column_dictionary_enabled(path, true),
             _ => builder.set_column_encoding(path, Encoding::PLAIN),
         };
     }
@@ -98,7 +99,7 @@ pub(super) fn properties(schema: &Schema) -> WriterProperties {
 }
 
 /// A block of whole episodes as columns.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub(super) struct Block {
     /// Rows held.
     pub(super) rows: usize,
@@ -161,30 +162,6 @@ impl Block {
         }
         self.reward.extend_from_slice(&e.reward);
         self.reward.push(0.0);
-    }
-
-    /// A copy of the rows from `from` on.
-    pub(super) fn tail(&self, from: usize) -> Self {
-        fn cut<T: Clone>(column: &[T], from: usize, rows: usize) -> Vec<T> {
-            column[from * (column.len() / rows.max(1))..].to_vec()
-        }
-        let rows = self.rows;
-        let floats = |columns: &[Vec<f32>]| columns.iter().map(|c| cut(c, from, rows)).collect();
-        Self {
-            rows: rows - from,
-            episode: cut(&self.episode, from, rows),
-            step: cut(&self.step, from, rows),
-            first: cut(&self.first, from, rows),
-            last: cut(&self.last, from, rows),
-            terminal: cut(&self.terminal, from, rows),
-            state: cut(&self.state, from, rows),
-            observations: floats(&self.observations),
-            messages: floats(&self.messages),
-            link: cut(&self.link, from, rows),
-            actions: floats(&self.actions),
-            reward: cut(&self.reward, from, rows),
-            rewards: floats(&self.rewards),
-        }
     }
 
     /// The block as a record batch of `schema`, without copying its floats.

@@ -6,51 +6,59 @@ use std::path::{Path, PathBuf};
 use arrow::array::{
     Array, ArrayRef, BooleanArray, FixedSizeListArray, Float32Array, Float64Array, Int32Array, Int64Array, RecordBatch,
 };
-use arrow::datatypes::{DataType, Field};
+use arrow::datatypes::{DataType, Field, Schema};
+use arrow::error::ArrowError;
 use parquet::arrow::ProjectionMask;
-use parquet::arrow::arrow_reader::{ParquetRecordBatchReader, ParquetRecordBatchReaderBuilder};
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
 use super::columns::{row_bytes, schema};
+use super::pages::check_pages;
 use crate::io::IoError;
 use crate::schema::{Episode, Layout};
 use crate::storage::StorageError;
 
 /// Bytes of a batch of rows in memory, about.
 const BATCH_BYTES: u64 = 16 << 20;
+/// Largest page of a store, bytes; ccmarl's own are about a mebibyte, or one row.
+const PAGE_LIMIT: u64 = 64 << 20;
 
 /// Reads the episodes of one file in order.
 pub(super) struct Decoder {
     path: PathBuf,
     layout: Layout,
     columns: Vec<String>,
-    reader: ParquetRecordBatchReader,
+    reader: Batches,
     batch: Option<Batch>,
+    /// Whether the reader has given up, so that no further batch can come.
+    broken: bool,
 }
+
+/// Batches of rows from a file or a journal.
+type Batches = Box<dyn Iterator<Item = Result<RecordBatch, ArrowError>> + Send>;
 
 impl Decoder {
     /// Opens a file and compares its columns with the layout.
     pub(super) fn open(path: &Path, layout: &Layout) -> Result<Self, StorageError> {
         let file = File::open(path).map_err(IoError::os("open", path))?;
+        let pages = file.try_clone().map_err(IoError::os("open", path))?;
         let builder = guard(path, || ParquetRecordBatchReaderBuilder::try_new(file))?;
-        let expected = schema(layout);
-        let mut roots = Vec::new();
-        for field in expected.fields() {
-            let found = builder.schema().fields().iter().position(|f| f.name() == field.name());
-            let Some(index) = found else {
-                return Err(damaged(path, format!("column {} is missing", field.name())));
-            };
-            let (kind, wanted) = (builder.schema().field(index).data_type(), field.data_type());
-            if !same(kind, wanted) {
-                let (wanted, kind) = (show(wanted), show(kind));
-                return Err(damaged(path, format!("column {}: expected {wanted}, found {kind}", field.name())));
-            }
-            roots.push(index);
-        }
+        check_pages(&pages, builder.metadata(), PAGE_LIMIT).map_err(|m| damaged(path, m))?;
+        let roots = roots(builder.schema(), layout, path)?;
         let rows = (BATCH_BYTES / row_bytes(layout)).clamp(1, 8192) as usize;
         let mask = ProjectionMask::roots(builder.parquet_schema(), roots);
         let reader = guard(path, || builder.with_projection(mask).with_batch_size(rows).build())?;
-        let columns = expected.fields().iter().map(|f| f.name().clone()).collect();
-        Ok(Self { path: path.to_owned(), layout: layout.clone(), columns, reader, batch: None })
+        Ok(Self::new(path, layout, Box::new(reader)))
+    }
+
+    /// Reads the batches of a journal, whose columns are compared with the layout.
+    pub(super) fn journal(path: &Path, layout: &Layout, found: &Schema, rows: Batches) -> Result<Self, StorageError> {
+        roots(found, layout, path)?;
+        Ok(Self::new(path, layout, rows))
+    }
+
+    fn new(path: &Path, layout: &Layout, reader: Batches) -> Self {
+        let columns = schema(layout).fields().iter().map(|f| f.name().clone()).collect();
+        Self { path: path.to_owned(), layout: layout.clone(), columns, reader, batch: None, broken: false }
     }
 
     /// The next episode, which must have number `index`; `None` at the end of the file.
@@ -61,7 +69,9 @@ impl Decoder {
             let batch = match &mut self.batch {
                 Some(batch) if batch.at < batch.rows => batch,
                 slot => {
-                    let Some(next) = guard(&self.path, || self.reader.next().transpose())? else {
+                    let next = guard(&self.path, || self.reader.next().transpose());
+                    self.broken |= next.is_err();
+                    let Some(next) = next? else {
                         let cut = format!("episode {index} ends after {rows} rows without is_last");
                         return if rows == 0 { Ok(None) } else { Err(damaged(&self.path, cut)) };
                     };
@@ -75,6 +85,42 @@ impl Decoder {
             }
         }
     }
+
+    /// After an error: passes over the rest of the bad episode and returns the number of the next; `None` at the end.
+    pub(super) fn skip(&mut self) -> Option<u64> {
+        loop {
+            if let Some(batch) = &mut self.batch {
+                let begins = |&r: &usize| batch.first.value(r) && batch.step.value(r) == 0;
+                if let Some(row) = (batch.at.max(batch.passed)..batch.rows).find(begins) {
+                    (batch.at, batch.passed) = (row, row + 1);
+                    return u64::try_from(batch.episode.value(row)).ok();
+                }
+            }
+            if self.broken {
+                return None;
+            }
+            let next = guard(&self.path, || self.reader.next().transpose());
+            self.broken |= !matches!(next, Ok(Some(_)));
+            self.batch = next.ok().flatten().and_then(|batch| Batch::new(&batch, &self.columns).ok());
+        }
+    }
+}
+
+/// Where the columns of the layout stand among those found, each of the right type.
+fn roots(found: &Schema, layout: &Layout, path: &Path) -> Result<Vec<usize>, StorageError> {
+    let mut roots = Vec::new();
+    for field in schema(layout).fields() {
+        let Some(index) = found.fields().iter().position(|f| f.name() == field.name()) else {
+            return Err(damaged(path, format!("column {} is missing", field.name())));
+        };
+        let (kind, wanted) = (found.field(index).data_type(), field.data_type());
+        if !same(kind, wanted) {
+            let (wanted, kind) = (show(wanted), show(kind));
+            return Err(damaged(path, format!("column {}: expected {wanted}, found {kind}", field.name())));
+        }
+        roots.push(index);
+    }
+    Ok(roots)
 }
 
 /// The columns of a batch, and the row at which the next episode begins.
@@ -88,6 +134,8 @@ struct Batch {
     terminal: BooleanArray,
     /// The other columns, in schema order.
     rest: Vec<ArrayRef>,
+    /// Rows before this one were passed over.
+    passed: usize,
 }
 
 impl Batch {
@@ -123,7 +171,7 @@ impl Batch {
         }
         let (episode, step) = (typed(&sorted[0])?, typed(&sorted[1])?);
         let (first, terminal) = (typed(&sorted[2])?, typed(&sorted[4])?);
-        Ok(Self { rows: batch.num_rows(), at: 0, episode, step, first, last, terminal, rest })
+        Ok(Self { rows: batch.num_rows(), at: 0, episode, step, first, last, terminal, rest, passed: 0 })
     }
 
     /// Moves the rows of the episode that begins or goes on at `at` over; whether its last row is among them.
@@ -198,7 +246,10 @@ fn elements<A: Array + 'static>(array: &ArrayRef) -> Result<(&A, usize), String>
 
 /// Runs a call into the decoder. It reports most faults as errors, but a file made to harm can make it panic; that
 /// becomes an error as well.
-fn guard<T, E: std::fmt::Display>(path: &Path, call: impl FnOnce() -> Result<T, E>) -> Result<T, StorageError> {
+pub(super) fn guard<T, E: std::fmt::Display>(
+    path: &Path,
+    call: impl FnOnce() -> Result<T, E>,
+) -> Result<T, StorageError> {
     match crate::io::caught(call) {
         Some(Ok(value)) => Ok(value),
         Some(Err(error)) => Err(damaged(path, format!("cannot be decoded: {error}"))),

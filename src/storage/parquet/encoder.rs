@@ -1,6 +1,7 @@
-//! The encoder: a thread of its own that turns record batches into Parquet files while the next episodes are made.
+//! The encoder: encodes blocks of rows on the caller's threads, and puts the row groups into Parquet files, which takes
+//! digests and system calls, on a thread of its own.
 //!
-//! Its output depends only on the sequence of jobs, never on timing.
+//! Its output depends only on the sequence of calls, never on timing.
 
 use std::fs::File;
 use std::io::{BufWriter, Read as _, Seek as _, SeekFrom, Write};
@@ -11,24 +12,25 @@ use std::thread::JoinHandle;
 use arrow::array::RecordBatch;
 use arrow::datatypes::SchemaRef;
 use parquet::arrow::ArrowWriter;
+use parquet::arrow::arrow_writer::ArrowColumnChunk;
 use parquet::errors::ParquetError;
 use parquet::file::metadata::KeyValue;
+use parquet::file::writer::SerializedFileWriter;
 use sha2::{Digest as _, Sha256};
 
 use super::columns::properties;
+use super::group::Group;
 use super::{FILE_SHA256_KEY, find_file_digest};
 use crate::io::IoError;
 use crate::schema::{SELF_SHA256_PLACEHOLDER, hex};
 use crate::storage::StorageError;
 
-/// What the encoder is told to do, in order.
-pub(super) enum Job {
-    /// Rows of whole episodes.
-    Rows(RecordBatch),
-    /// The row group ends here.
-    EndGroup,
-    /// The file ends here; its metadata, and the journals that it makes superfluous.
-    EndFile(Vec<KeyValue>, Vec<PathBuf>),
+/// What the thread is told to do, in order.
+enum Job {
+    /// A row group.
+    Group(Vec<ArrowColumnChunk>),
+    /// The file ends here; its metadata, and the journal that it makes superfluous.
+    EndFile(Vec<KeyValue>, Option<PathBuf>),
 }
 
 /// A finished file.
@@ -41,20 +43,44 @@ pub(super) struct Sealed {
 
 /// The sink's end of the encoder.
 pub(super) struct Encoder {
+    group: Group,
+    /// Where its files are.
+    pub(super) directory: PathBuf,
     jobs: Option<SyncSender<Job>>,
     thread: Option<JoinHandle<Result<Vec<Sealed>, StorageError>>>,
 }
 
 impl Encoder {
-    /// Starts the thread; `name(k)` is the k-th file, written as `<name>.tmp` until it is whole.
-    pub(super) fn start(schema: SchemaRef, name: impl Fn(usize) -> PathBuf + Send + 'static) -> Self {
+    /// Starts the thread; the k-th file is `name(k)` in `directory`, written as `<name>.tmp` until it is whole.
+    pub(super) fn start(schema: SchemaRef, directory: &Path, name: fn(usize) -> String) -> Result<Self, StorageError> {
+        let group = Group::new(SchemaRef::clone(&schema)).map_err(|e| refused(e, directory))?;
         let (jobs, inbox) = sync_channel(2);
-        let thread = std::thread::spawn(move || encode(&inbox, &schema, name));
-        Self { jobs: Some(jobs), thread: Some(thread) }
+        let place = directory.to_owned();
+        let thread = std::thread::spawn(move || assemble(&inbox, &schema, |k| place.join(name(k))));
+        Ok(Self { group, directory: directory.to_owned(), jobs: Some(jobs), thread: Some(thread) })
     }
 
-    /// Hands over a job; waits while the encoder is behind.
-    pub(super) fn send(&mut self, job: Job) -> Result<(), StorageError> {
+    /// Encodes rows of whole episodes.
+    pub(super) fn write(&mut self, batch: &RecordBatch) -> Result<(), StorageError> {
+        self.group.write(batch).map_err(|e| refused(e, &self.directory))
+    }
+
+    /// Ends the row group, if it has rows.
+    pub(super) fn end_group(&mut self) -> Result<(), StorageError> {
+        match self.group.end().map_err(|e| refused(e, &self.directory))? {
+            Some(chunks) => self.send(Job::Group(chunks)),
+            None => Ok(()),
+        }
+    }
+
+    /// Ends the file with this metadata; `journal` is removed once the file is in place.
+    pub(super) fn end_file(&mut self, metadata: Vec<KeyValue>, journal: Option<PathBuf>) -> Result<(), StorageError> {
+        self.end_group()?;
+        self.send(Job::EndFile(metadata, journal))
+    }
+
+    /// Hands over a job; waits while the thread is behind.
+    fn send(&mut self, job: Job) -> Result<(), StorageError> {
         match &self.jobs {
             Some(jobs) if jobs.send(job).is_ok() => Ok(()),
             _ => self.join().map(drop).and(Err(gone())),
@@ -73,13 +99,14 @@ fn gone() -> StorageError {
     StorageError::Damaged { message, path: PathBuf::new() }
 }
 
-fn encode(
+/// Puts row groups into files.
+fn assemble(
     inbox: &Receiver<Job>,
     schema: &SchemaRef,
     name: impl Fn(usize) -> PathBuf,
 ) -> Result<Vec<Sealed>, StorageError> {
     let mut sealed = Vec::new();
-    let mut open: Option<(ArrowWriter<HashingFile>, PathBuf)> = None;
+    let mut open: Option<(SerializedFileWriter<HashingFile>, PathBuf)> = None;
     for job in inbox {
         let (writer, path) = match &mut open {
             Some((writer, path)) => (writer, path),
@@ -89,21 +116,22 @@ fn encode(
                 let file = File::create(&temporary).map_err(IoError::os("create", &temporary))?;
                 let file = HashingFile { file: BufWriter::with_capacity(1 << 18, file), hash: Sha256::new(), bytes: 0 };
                 let writer = ArrowWriter::try_new(file, SchemaRef::clone(schema), Some(properties(schema)))
-                    .map_err(|e| refused(e, &temporary))?;
+                    .and_then(ArrowWriter::into_serialized_writer)
+                    .map_err(|e| refused(e, &temporary))?
+                    .0;
                 let (writer, path) = none.insert((writer, path));
                 (writer, path)
             }
         };
         match job {
-            Job::Rows(batch) => writer.write(&batch).map_err(|e| refused(e, path))?,
-            Job::EndGroup => writer.flush().map_err(|e| refused(e, path))?,
-            Job::EndFile(metadata, journals) => {
+            Job::Group(chunks) => append(writer, chunks).map_err(|e| refused(e, path))?,
+            Job::EndFile(metadata, journal) => {
                 for entry in metadata {
                     writer.append_key_value_metadata(entry);
                 }
                 let Some((writer, path)) = open.take() else { continue };
                 sealed.push(seal(writer, &path)?);
-                for journal in journals {
+                if let Some(journal) = journal {
                     std::fs::remove_file(&journal).map_err(IoError::os("remove the journal", &journal))?;
                 }
             }
@@ -112,8 +140,16 @@ fn encode(
     Ok(sealed)
 }
 
+fn append(writer: &mut SerializedFileWriter<HashingFile>, chunks: Vec<ArrowColumnChunk>) -> Result<(), ParquetError> {
+    let mut group = writer.next_row_group()?;
+    for chunk in chunks {
+        chunk.append_to_row_group(&mut group)?;
+    }
+    group.close().map(drop)
+}
+
 /// Puts a finished file on disk under its name, and its own digest into it where it asks for that.
-fn seal(writer: ArrowWriter<HashingFile>, path: &Path) -> Result<Sealed, StorageError> {
+fn seal(writer: SerializedFileWriter<HashingFile>, path: &Path) -> Result<Sealed, StorageError> {
     let temporary = temporary(path);
     let os = |action| IoError::os(action, &temporary);
     let out = writer.into_inner().map_err(|e| refused(e, &temporary))?;
@@ -145,7 +181,8 @@ fn temporary(path: &Path) -> PathBuf {
     path.with_extension("parquet.tmp")
 }
 
-fn refused(error: ParquetError, path: &Path) -> StorageError {
+/// A Parquet error as one of the store; `path` is where it happened.
+pub(super) fn refused(error: ParquetError, path: &Path) -> StorageError {
     match error {
         ParquetError::External(source) => match source.downcast::<std::io::Error>() {
             Ok(source) => IoError::os("write", path)(*source).into(),

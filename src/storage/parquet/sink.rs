@@ -1,23 +1,20 @@
-//! Writing: blocks of episodes go to the journal and to the encoder; files are cut at fixed counts.
+//! Writing: episodes go to the journal and to the encoder; blocks, row groups and files are cut at fixed counts.
 
 use std::fs::File;
-use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
-use arrow::array::RecordBatch;
-use arrow::datatypes::{Metadata, Schema, SchemaRef};
-use arrow::error::ArrowError;
-use arrow::ipc::writer::StreamWriter;
+use arrow::datatypes::SchemaRef;
 use parquet::file::metadata::KeyValue;
 
 use super::columns::{Block, row_bytes, schema};
-use super::encoder::{Encoder, Job, file_digest_entry};
+use super::encoder::{Encoder, file_digest_entry};
+use super::journal::{Journal, refused};
 use super::{MANIFEST_FILE, MANIFEST_KEY, PART_KEY, is_single};
 use crate::io::{self, IoError};
 use crate::schema::{Episode, Layout, Manifest, Part};
-use crate::storage::{EpisodeSink, StorageError, Tally, start_partial};
+use crate::storage::{EpisodeSink, StorageError, Tally, lock, start_partial};
 
-/// Rows of a block: what goes to the journal and to the encoder at once.
+/// Rows that are encoded at once.
 const BLOCK_ROWS: usize = 8192;
 /// Rows of a row group at most, unless one episode is longer.
 const GROUP_ROWS: usize = 1 << 17;
@@ -37,18 +34,68 @@ pub(super) struct ParquetSink {
     manifest: Manifest,
     layout: Layout,
     schema: SchemaRef,
-    block: Block,
-    /// Rows of the block that the journal already holds.
-    journaled: usize,
-    journal: Option<StreamWriter<BufWriter<File>>>,
-    group_rows: usize,
+    rows: Rows,
+    journal: Option<Journal>,
     part: Tally,
     part_bytes: u64,
     part_start: u64,
     parts: Vec<Part>,
     total: Tally,
-    encoder: Encoder,
+    /// Held until the store has its name.
+    _lock: File,
     finished: bool,
+}
+
+/// Rows on their way into the file.
+struct Rows {
+    schema: SchemaRef,
+    block: Block,
+    /// Rows of the row group, those of the block included.
+    group: usize,
+    encoder: Encoder,
+}
+
+impl Rows {
+    /// Adds whole episodes.
+    fn push(&mut self, layout: &Layout, episodes: &[Episode]) -> Result<(), StorageError> {
+        for episode in episodes {
+            let rows = episode.rows();
+            if self.group > 0 && self.group + rows > GROUP_ROWS {
+                self.end_block(layout)?;
+                self.encoder.end_group()?;
+                self.group = 0;
+            }
+            self.block.push(layout, episode);
+            self.group += rows;
+            if self.block.rows >= BLOCK_ROWS {
+                self.end_block(layout)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Encodes what there is.
+    fn end_block(&mut self, layout: &Layout) -> Result<(), StorageError> {
+        if self.block.rows == 0 {
+            return Ok(());
+        }
+        let next = Block::new(layout, self.block.rows + self.block.rows / 64);
+        let block = std::mem::replace(&mut self.block, next);
+        let batch = block.into_batch(&self.schema).map_err(|e| refused(e, &self.encoder.directory))?;
+        self.encoder.write(&batch)
+    }
+
+    /// Ends the file.
+    fn end_file(
+        &mut self,
+        layout: &Layout,
+        metadata: Vec<KeyValue>,
+        journal: Option<PathBuf>,
+    ) -> Result<(), StorageError> {
+        self.end_block(layout)?;
+        self.group = 0;
+        self.encoder.end_file(metadata, journal)
+    }
 }
 
 impl ParquetSink {
@@ -59,46 +106,35 @@ impl ParquetSink {
         layout.check().map_err(|source| StorageError::Schema { source, path: path.to_owned() })?;
         let partial = start_partial(path, force)?;
         std::fs::create_dir(&partial).map_err(IoError::os("create the directory", &partial))?;
+        let lock = lock::hold_directory(&partial)?;
         let schema = schema(&layout);
-        let directory = partial.clone();
-        let encoder = Encoder::start(SchemaRef::clone(&schema), move |k| directory.join(part_name(k)));
+        let encoder = Encoder::start(SchemaRef::clone(&schema), &partial, part_name)?;
+        let rows = Rows { schema: SchemaRef::clone(&schema), block: Block::new(&layout, 0), group: 0, encoder };
         let mut sink = Self {
             path: path.to_owned(),
             partial,
             force,
             single,
             manifest: manifest.clone(),
-            schema,
-            block: Block::new(&layout, 0),
             layout,
-            journaled: 0,
+            schema,
+            rows,
             journal: None,
-            group_rows: 0,
             part: Tally::default(),
             part_bytes: 0,
             part_start: 0,
             parts: Vec::new(),
             total: Tally::default(),
-            encoder,
+            _lock: lock,
             finished: false,
         };
         sink.start_journal()?;
         Ok(sink)
     }
 
-    fn journal_path(&self) -> PathBuf {
-        self.partial.join(format!("journal-{:05}.arrows", self.parts.len()))
-    }
-
-    /// The journal of the next part. Its Arrow schema carries the unsealed manifest, so that it can be read alone.
     fn start_journal(&mut self) -> Result<(), StorageError> {
-        let path = self.journal_path();
-        let file = File::create_new(&path).map_err(IoError::os("create", &path))?;
-        let fields = self.schema.fields().clone();
-        let entries = Metadata::from([(MANIFEST_KEY, self.unsealed()?)]);
-        let schema = Schema::new_with_metadata(fields, entries);
-        let writer = StreamWriter::try_new(BufWriter::with_capacity(1 << 18, file), &schema);
-        self.journal = Some(writer.map_err(|e| refused(e, &path))?);
+        let manifest = self.unsealed()?;
+        self.journal = Some(Journal::create(&self.partial, self.parts.len(), &self.schema, manifest)?);
         Ok(())
     }
 
@@ -107,47 +143,32 @@ impl ParquetSink {
         unsealed.sealed_json().map_err(|source| StorageError::Schema { source, path: self.path.clone() })
     }
 
-    fn write_journal(&mut self, batch: &RecordBatch) -> Result<(), StorageError> {
-        let path = self.journal_path();
-        if let Some(journal) = &mut self.journal {
-            journal.write(batch).map_err(|e| refused(e, &path))?;
+    /// How many of these episodes the open part still takes.
+    fn room(&self, episodes: &[Episode]) -> usize {
+        if self.single {
+            return episodes.len();
         }
-        Ok(())
-    }
-
-    /// Sends the block to the journal (what it does not hold yet) and to the encoder.
-    fn flush_block(&mut self) -> Result<(), StorageError> {
-        if self.block.rows == 0 {
-            return Ok(());
-        }
-        let next = Block::new(&self.layout, self.block.rows + self.block.rows / 64);
-        let block = std::mem::replace(&mut self.block, next);
-        let from = std::mem::take(&mut self.journaled);
-        let tail = (from > 0 && from < block.rows).then(|| block.tail(from));
-        let whole = from == 0;
-        let batch = block.into_batch(&self.schema).map_err(|e| refused(e, &self.path))?;
-        if let Some(tail) = tail {
-            let tail = tail.into_batch(&self.schema).map_err(|e| refused(e, &self.path))?;
-            self.write_journal(&tail)?;
-        } else if whole {
-            self.write_journal(&batch)?;
-        }
-        self.encoder.send(Job::Rows(batch))
+        let (mut count, mut bytes, row) = (self.part.episodes, self.part_bytes, row_bytes(&self.layout));
+        let fits = |episode: &&Episode| {
+            let more = bytes + episode.rows() as u64 * row;
+            let fits = count == 0 || (count < PART_EPISODES && more <= PART_BYTES);
+            (count, bytes) = (count + 1, more);
+            fits
+        };
+        episodes.iter().take_while(fits).count()
     }
 
     /// Ends the file that is being written.
     fn end_part(&mut self, metadata: Vec<KeyValue>) -> Result<(), StorageError> {
-        self.flush_block()?;
         self.commit()?;
-        let journal = self.journal_path();
-        self.journal = None;
-        self.encoder.send(Job::EndFile(metadata, vec![journal]))?;
+        let journal = self.journal.take().map(|journal| journal.path);
+        self.rows.end_file(&self.layout, metadata, journal)?;
         let part = std::mem::take(&mut self.part);
         let end = self.part_start + part.episodes;
         let content = part.content();
         let file = part_name(self.parts.len());
         self.parts.push(Part { file, episodes: [self.part_start, end], bytes: 0, sha256: String::new(), content });
-        (self.part_start, self.part_bytes, self.group_rows) = (end, 0, 0);
+        (self.part_start, self.part_bytes) = (end, 0);
         Ok(())
     }
 
@@ -159,41 +180,38 @@ impl ParquetSink {
 
 impl EpisodeSink for ParquetSink {
     fn append(&mut self, episode: &Episode) -> Result<(), StorageError> {
-        let hash = self
-            .total
-            .check(&self.layout, episode)
-            .map_err(|source| StorageError::Schema { source, path: self.path.clone() })?;
-        let rows = episode.rows();
-        let bytes = rows as u64 * row_bytes(&self.layout);
-        let full = self.part.episodes >= PART_EPISODES || self.part_bytes + bytes > PART_BYTES;
-        if !self.single && self.part.episodes > 0 && full {
+        self.append_all(std::slice::from_ref(episode))
+    }
+
+    fn append_all(&mut self, episodes: &[Episode]) -> Result<(), StorageError> {
+        let schema = |source| StorageError::Schema { source, path: self.path.clone() };
+        let hashes = self.total.check_all(&self.layout, episodes).map_err(schema)?;
+        let (mut episodes, mut hashes) = (episodes, &hashes[..]);
+        loop {
+            let (now, later) = episodes.split_at(self.room(episodes));
+            let (rows, journal, layout) = (&mut self.rows, &mut self.journal, &self.layout);
+            // the journal takes a copy and a system call, the columns processor time
+            let journal = || journal.as_mut().map_or(Ok(()), |journal| journal.write(layout, now));
+            let (journaled, encoded) = rayon::join(journal, || rows.push(layout, now));
+            journaled.and(encoded)?;
+            for (episode, hash) in now.iter().zip(hashes) {
+                self.part.add(episode, hash);
+                self.total.add(episode, hash);
+                self.part_bytes += episode.rows() as u64 * row_bytes(&self.layout);
+            }
+            if later.is_empty() {
+                return Ok(());
+            }
+            (episodes, hashes) = (later, &hashes[now.len()..]);
             let metadata = self.part_metadata()?;
             self.end_part(metadata)?;
             self.start_journal()?;
         }
-        if self.group_rows > 0 && self.group_rows + rows > GROUP_ROWS {
-            self.flush_block()?;
-            self.encoder.send(Job::EndGroup)?;
-            self.group_rows = 0;
-        }
-        self.block.push(&self.layout, episode);
-        self.group_rows += rows;
-        self.part_bytes += bytes;
-        self.part.add(episode, &hash);
-        self.total.add(episode, &hash);
-        if self.block.rows >= BLOCK_ROWS { self.flush_block() } else { Ok(()) }
     }
 
     fn commit(&mut self) -> Result<u64, StorageError> {
-        if self.journaled < self.block.rows {
-            let tail = self.block.tail(self.journaled);
-            self.journaled = self.block.rows;
-            let batch = tail.into_batch(&self.schema).map_err(|e| refused(e, &self.path))?;
-            self.write_journal(&batch)?;
-        }
-        let path = self.journal_path();
         if let Some(journal) = &mut self.journal {
-            journal.flush().map_err(|e| refused(e, &path))?;
+            journal.flush()?;
         }
         Ok(self.total.episodes)
     }
@@ -205,7 +223,7 @@ impl EpisodeSink for ParquetSink {
         if self.single {
             let text = self.manifest.sealed_json().map_err(schema)?;
             self.end_part(vec![KeyValue::new(MANIFEST_KEY.to_owned(), text.clone()), file_digest_entry()])?;
-            self.encoder.join()?;
+            self.rows.encoder.join()?;
             let file = self.partial.join(part_name(0));
             io::publish(&file, &self.path, self.force, MANIFEST_FILE)?;
             self.finished = true;
@@ -215,12 +233,13 @@ impl EpisodeSink for ParquetSink {
         let metadata = self.part_metadata()?;
         self.end_part(metadata)?;
         let mut parts = std::mem::take(&mut self.parts);
-        for (part, sealed) in parts.iter_mut().zip(self.encoder.join()?) {
+        for (part, sealed) in parts.iter_mut().zip(self.rows.encoder.join()?) {
             (part.bytes, part.sha256) = (sealed.bytes, sealed.sha256);
         }
         self.manifest.parts = parts;
         let text = self.manifest.sealed_json().map_err(schema)?;
         io::write_atomic(&self.partial.join(MANIFEST_FILE), text.as_bytes())?;
+        lock::release(&self.partial)?;
         io::sync_dir(&self.partial)?;
         io::publish(&self.partial, &self.path, self.force, MANIFEST_FILE)?;
         self.finished = true;
@@ -233,7 +252,7 @@ impl Drop for ParquetSink {
     fn drop(&mut self) {
         if !self.finished {
             self.commit().ok();
-            self.encoder.join().ok();
+            self.rows.encoder.join().ok();
             if self.total.episodes == 0 {
                 std::fs::remove_dir_all(&self.partial).ok();
             }
@@ -241,14 +260,6 @@ impl Drop for ParquetSink {
     }
 }
 
-fn part_name(index: usize) -> String {
+pub(super) fn part_name(index: usize) -> String {
     format!("part-{index:05}.parquet")
-}
-
-fn refused(error: ArrowError, path: &Path) -> StorageError {
-    let source = match error {
-        ArrowError::IoError(_, source) => source,
-        other => std::io::Error::other(other.to_string()),
-    };
-    IoError::os("write", path)(source).into()
 }

@@ -95,6 +95,18 @@ impl EpisodeSource for Parts {
         &self.manifest
     }
 
+    fn skip_to(&mut self, episode: u64) -> Result<(), StorageError> {
+        while let Some(part) = self.manifest.parts.get(self.next_part)
+            && self.current.is_none()
+            && part.episodes[1] <= episode
+        {
+            self.total.skip_to(part.episodes[1]);
+            self.next_part += 1;
+        }
+        while self.total.episodes < episode && self.next_episode()?.is_some() {}
+        Ok(())
+    }
+
     fn next_episode(&mut self) -> Result<Option<Episode>, StorageError> {
         loop {
             let Some((decoder, tally)) = &mut self.current else {
@@ -178,7 +190,7 @@ fn parse(text: &str, path: &Path) -> Result<Manifest, StorageError> {
 }
 
 /// Checks a single file against the digest that it carries; says what it is when it carries none.
-fn check_file(path: &Path) -> Result<(), StorageError> {
+pub(super) fn check_file(path: &Path) -> Result<(), StorageError> {
     let os = |action| IoError::os(action, path);
     let not = |message: &str| Err(StorageError::NotAStore { message: message.to_owned(), path: path.to_owned() });
     let mut file = File::open(path).map_err(os("open"))?;
@@ -191,8 +203,7 @@ fn check_file(path: &Path) -> Result<(), StorageError> {
     let mut end = [0; 8];
     file.read_exact(&mut end).map_err(os("read"))?;
     if end[4..] != *b"PAR1" {
-        let message = "cut short, it does not end as a Parquet file: copy it again".to_owned();
-        return Err(StorageError::Damaged { message, path: path.to_owned() });
+        return Err(StorageError::Truncated { episodes: 0, path: path.to_owned() });
     }
     let footer = u64::from(u32::from_le_bytes([end[0], end[1], end[2], end[3]])).min(size - 8);
     // The entry stands near the footer's end, so one mebibyte is enough however long a footer claims to be.

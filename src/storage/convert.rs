@@ -1,0 +1,52 @@
+//! From one form to another, episode by episode.
+
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use super::{StorageError, create, open};
+use crate::io::{self, IoError};
+use crate::schema::{Episode, Manifest};
+
+/// Writes the episodes of the store `from` into a new one `to`, whose name chooses the form. The manifest stays but for
+/// what belongs to the form; the content digest of the new store is compared with the old one's. Memory is bounded.
+/// When it fails or `stop` turns true, nothing is left; `None` then.
+///
+/// # Errors
+/// [`StorageError`] when `from` is damaged, `to` exists (without `force`) or is `from`, or the disk refuses.
+pub fn convert(
+    from: &Path,
+    to: &Path,
+    force: bool,
+    watch: &mut dyn FnMut(&Manifest, &Episode),
+    stop: &AtomicBool,
+) -> Result<Option<Manifest>, StorageError> {
+    let real = |path: &Path| path.canonicalize().ok();
+    if real(from).is_some() && real(from) == real(to) {
+        return Err(IoError::Exists(to.to_owned()).into());
+    }
+    let mut source = open(from)?;
+    let manifest = source.manifest().clone();
+    let mut sink = create(to, &manifest.unsealed(), force)?;
+    let mut copy = || -> Result<bool, StorageError> {
+        while let Some(episode) = source.next_episode()? {
+            if stop.load(Ordering::Relaxed) {
+                return Ok(false);
+            }
+            sink.append(&episode)?;
+            watch(&manifest, &episode);
+        }
+        Ok(true)
+    };
+    let copied = copy();
+    if !matches!(copied, Ok(true)) {
+        drop(sink);
+        io::remove(&io::partial_path(to))?; // the source has it all
+        return copied.map(|_| None);
+    }
+    let written = sink.finish()?;
+    if written.content != manifest.content {
+        let message = format!("expected content {}, wrote {}", manifest.content, written.content);
+        return Err(StorageError::Damaged { message, path: to.to_owned() });
+    }
+    Ok(Some(written))
+}

@@ -1,0 +1,66 @@
+//! One writer per name. The operating system holds the lock and lets it go when the process ends, however it ends, so
+//! none is ever stale: what a kill left is not locked.
+
+use std::fs::{File, TryLockError};
+use std::io::{Read as _, Write as _};
+use std::path::{Path, PathBuf};
+
+use super::StorageError;
+use crate::io::IoError;
+
+/// Name of the lock within a directory that is being written; it holds the writer's process number.
+const LOCK_FILE: &str = "lock";
+
+/// Locks the directory in which this process writes a store.
+pub(super) fn hold_directory(directory: &Path) -> Result<File, StorageError> {
+    let path = directory.join(LOCK_FILE);
+    let mut file = File::create_new(&path).map_err(IoError::os("create", &path))?;
+    take(&file, directory, None)?;
+    write!(file, "{}", std::process::id()).map_err(IoError::os("write", &path))?;
+    Ok(file)
+}
+
+/// Locks the file in which this process writes a store.
+pub(super) fn hold_file(file: &File, path: &Path) -> Result<(), StorageError> {
+    take(file, path, None)
+}
+
+/// Removes the lock of a directory that is whole.
+pub(super) fn release(directory: &Path) -> Result<(), StorageError> {
+    let path = directory.join(LOCK_FILE);
+    std::fs::remove_file(&path).map_err(IoError::os("remove", &path))?;
+    Ok(())
+}
+
+/// Locks what a writer left behind; refused while that writer lives.
+pub(super) fn hold_leftover(leftover: &Path) -> Result<Option<File>, StorageError> {
+    let path = if leftover.is_dir() { leftover.join(LOCK_FILE) } else { leftover.to_owned() };
+    let Ok(mut file) = File::open(&path) else { return Ok(None) };
+    let mut owner = String::new();
+    if leftover.is_dir() {
+        (&mut file).take(20).read_to_string(&mut owner).ok();
+    }
+    take(&file, leftover, owner.parse().ok())?;
+    Ok(Some(file))
+}
+
+fn take(file: &File, path: &Path, owner: Option<u32>) -> Result<(), StorageError> {
+    match file.try_lock() {
+        Err(TryLockError::WouldBlock) => Err(StorageError::Busy { owner: Owner(owner), path: PathBuf::from(path) }),
+        // Some network file systems have no locks: there, two writers are told of each other by the name alone.
+        Ok(()) | Err(TryLockError::Error(_)) => Ok(()),
+    }
+}
+
+/// Who writes, as far as it is known.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Owner(Option<u32>);
+
+impl std::fmt::Display for Owner {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self.0 {
+            Some(pid) => write!(f, "process {pid}"),
+            None => f.write_str("another process"),
+        }
+    }
+}

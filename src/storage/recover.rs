@@ -1,0 +1,136 @@
+//! From what a kill left to a store under its name.
+
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
+
+use super::{Options, StorageError, format_of, lock};
+use crate::io::{self, IoError};
+use crate::schema::{Episode, Manifest};
+
+/// How a recovery ended.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Recovered {
+    /// Where the store is, or would be.
+    pub path: PathBuf,
+    /// Episodes in it; 0 when there was nothing to put in place.
+    pub episodes: u64,
+    /// Episodes that were to be recorded; 0 when nobody knew.
+    pub planned: u64,
+    /// Why the episodes end where they end, unless they ended in good order.
+    pub ended: Option<String>,
+}
+
+impl Recovered {
+    /// Whether episodes that were to be there are not, or may be missing since nobody knew how many.
+    pub fn is_loss(&self) -> bool {
+        self.ended.is_some() || self.planned == 0 || self.episodes < self.planned
+    }
+}
+
+/// What a kill left of the store that `path` names, and that store's name. `path` may be the name, the hidden `.partial`
+/// beside it, or a file within that.
+pub(super) fn unfinished(path: &Path) -> Option<(PathBuf, PathBuf)> {
+    for candidate in [Some(path), path.parent()].into_iter().flatten() {
+        if let Some(target) = target_of(candidate)
+            && candidate.exists()
+        {
+            return Some((candidate.to_owned(), target));
+        }
+    }
+    let partial = io::partial_path(path);
+    (!path.exists() && partial.exists()).then(|| (partial, path.to_owned()))
+}
+
+/// `.<name>.partial` → `<name>`.
+fn target_of(partial: &Path) -> Option<PathBuf> {
+    let name = partial.file_name()?.as_encoded_bytes();
+    let name = name.strip_prefix(b".")?.strip_suffix(b".partial")?;
+    let target = partial.with_file_name(os_str(name)?);
+    (io::partial_path(&target) == partial).then_some(target)
+}
+
+#[cfg(unix)]
+fn os_str(bytes: &[u8]) -> Option<&OsStr> {
+    Some(std::os::unix::ffi::OsStrExt::from_bytes(bytes))
+}
+
+#[cfg(not(unix))]
+fn os_str(bytes: &[u8]) -> Option<&OsStr> {
+    std::str::from_utf8(bytes).ok().map(OsStr::new)
+}
+
+/// Puts the whole episodes of an unfinished store under its name, and removes what was left. `path` is the name, or
+/// what is left beside it, or a finished file that was cut short; that one is replaced only with `force`. Memory is
+/// bounded. A kill meanwhile loses nothing: what was left goes last.
+///
+/// # Errors
+/// [`StorageError`] when there is nothing to recover, the name is taken and `force` is not given, a program is still
+/// writing it, or the disk refuses.
+pub fn recover(
+    path: &Path,
+    force: bool,
+    watch: &mut dyn FnMut(&Manifest, &Episode),
+) -> Result<Recovered, StorageError> {
+    let (leftover, target) = match unfinished(path) {
+        Some(found) => found,
+        None if io::partial_path(path).exists() => (io::partial_path(path), path.to_owned()),
+        None if path.exists() => (path.to_owned(), path.to_owned()),
+        None => return Err(IoError::Missing(path.to_owned()).into()),
+    };
+    if leftover == target {
+        let whole = |path: PathBuf| {
+            let message =
+                "it is no unfinished recording: nothing to recover; `ccmarl verify` says what is wrong".to_owned();
+            StorageError::NotAStore { message, path }
+        };
+        match super::open(&target) {
+            Err(StorageError::Truncated { .. }) => {}
+            Err(error) => return Err(error),
+            Ok(_) => return Err(whole(target)),
+        }
+    }
+    let _held = lock::hold_leftover(&leftover)?;
+    let format = format_of(&target).build;
+    if leftover != target
+        && target.exists()
+        && let (Ok(store), Err(StorageError::NotAStore { .. })) = (super::open(&target), (format.salvage)(&leftover))
+    {
+        // the kill came when the store had its name, before the empty rest was removed
+        io::remove(&leftover)?;
+        let episodes = store.manifest().episodes;
+        return Ok(Recovered { path: target, episodes, planned: store.manifest().planned.max(episodes), ended: None });
+    }
+    io::refuse_existing(&target, force)?;
+    let mut source = (format.salvage)(&leftover)?;
+    let manifest = source.manifest().clone();
+    let mut recovered = Recovered { path: target.clone(), episodes: 0, planned: manifest.planned, ended: None };
+    // Built under a name of its own, with the ending of the target, which chooses the format.
+    let mut name = std::ffi::OsString::from(".recovered.");
+    name.push(target.file_name().unwrap_or("out".as_ref()));
+    let built = target.with_file_name(name);
+    let mut sink = (format.create)(&built, &manifest, Options { force: true, viewer: true })?;
+    loop {
+        match source.next_episode() {
+            Ok(Some(episode)) => {
+                sink.append(&episode)?;
+                recovered.episodes += 1;
+                watch(&manifest, &episode);
+            }
+            Ok(None) | Err(StorageError::Truncated { .. }) => break,
+            Err(error @ StorageError::Io(_)) => return Err(error),
+            Err(error) => {
+                recovered.ended = Some(error.to_string());
+                break;
+            }
+        }
+    }
+    if recovered.episodes == 0 {
+        return Ok(recovered); // the sink removes what it began
+    }
+    sink.finish()?;
+    io::publish(&built, &target, force, "manifest.json")?;
+    if leftover != target {
+        io::remove(&leftover)?;
+    }
+    Ok(recovered)
+}
