@@ -8,6 +8,7 @@ mod evaluate;
 mod generate;
 mod inspect;
 mod list;
+mod pairs;
 mod quickstart;
 mod record;
 mod recover;
@@ -51,6 +52,8 @@ enum Command {
     Recover(recover::Args),
     /// Write a store in another form: directory, .parquet, .mcap
     Convert(convert::Args),
+    /// Turn a store into a table with one row per episode, step, sender and receiver
+    Pairs(pairs::Args),
     /// Estimate how much messages and actions, or any columns, tell about each other
     EstimateMi(estimate_mi::Args),
     /// Train a team over a link prior
@@ -105,6 +108,7 @@ fn dispatch(command: Command) -> anyhow::Result<Outcome> {
         Command::Verify(args) => verify::run(&args),
         Command::Recover(args) => recover::run(&args),
         Command::Convert(args) => convert::run(&args),
+        Command::Pairs(args) => pairs::run(&args),
         Command::EstimateMi(args) => estimate_mi::run(&args),
         Command::Train(args) => train::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),

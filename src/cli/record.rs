@@ -53,6 +53,9 @@ pub(super) struct Args {
     /// Replace the store if it exists
     #[arg(long)]
     force: bool,
+    /// Leave out what viewers draw (topics /scene and /poses of an .mcap)
+    #[arg(long)]
+    no_viewer: bool,
     /// How the summary is printed
     #[arg(long, value_enum, default_value_t)]
     format: ui::Format,
@@ -90,7 +93,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         return Err(Error::from(RecordError::NoEpisodes).into());
     }
     let stop = stop_flag()?;
-    let mut sink = storage::create(&args.out, &recording.manifest(), args.force).map_err(Error::from)?;
+    let options = storage::Options { force: args.force, viewer: !args.no_viewer };
+    let mut sink = storage::create_with(&args.out, &recording.manifest(), options).map_err(Error::from)?;
     let communicators = recording.layout().communicators().len();
     let bar = ui::progress(args.episodes, "episodes");
     let (mut summary, mut said) = (Summary::default(), Instant::now());

@@ -3,8 +3,9 @@
 //!
 //! # Definition
 //! Topic `/rollout/step` carries one protobuf message per row, `/rollout/episode` one per episode, after its rows, with
-//! its content hash. The schemas are in the file as descriptor sets (src/schema/proto/rollout.proto). The manifest is
-//! the metadata record `ccmarl.manifest`; `ccmarl.recording`, at the start, is what was known before the recording.
+//! its content hash. For viewers, `/scene` (`foxglove.SceneUpdate`: agents, landmarks, links) and `/poses`
+//! (`foxglove.PosesInFrame`: agents) repeat what a row says; readers of rollouts ignore both. The schemas are in the
+//! file as descriptor sets (src/schema/proto/\*.proto). The manifest is the metadata record `ccmarl.manifest`; `ccmarl.recording`, at the start, is what was known before the recording.
 //!
 //! # Shapes and units
 //! As in the schema: `state` f64\[S\], `observation`, `message`, `action` f32 per agent, `link` bool\[N·N\]. Times are
@@ -12,7 +13,7 @@
 //! when they were delivered, sequence is the step.
 //!
 //! # Parameters
-//! None. A chunk ends with each episode (and at 1 MiB), zstd, one thread, so that the bytes are the same anywhere.
+//! Whether viewers' topics are written (they are by default). A chunk ends with each episode (and at 1 MiB), zstd, one thread, so that the bytes are the same anywhere.
 //!
 //! # When it fails
 //! A file that was cut short is an error that counts its whole episodes. All checksums are checked before anything is
@@ -29,10 +30,11 @@ mod diagnose;
 mod proto;
 mod sink;
 mod source;
+mod viewer;
 
 use std::path::Path;
 
-use super::{EpisodeSink, EpisodeSource, Format, StorageError};
+use super::{EpisodeSink, EpisodeSource, Format, Options, StorageError};
 use crate::registry::Entry;
 use crate::schema::Manifest;
 
@@ -40,6 +42,10 @@ use crate::schema::Manifest;
 const STEP_TOPIC: &str = "/rollout/step";
 /// Topic of the ends of episodes.
 const EPISODE_TOPIC: &str = "/rollout/episode";
+/// Topic of the drawn world.
+const SCENE_TOPIC: &str = "/scene";
+/// Topic of the agents' poses.
+const POSES_TOPIC: &str = "/poses";
 /// Metadata record of the sealed manifest.
 const MANIFEST_RECORD: &str = "ccmarl.manifest";
 /// Metadata record of the manifest as it was before the recording.
@@ -60,8 +66,8 @@ fn claims(path: &Path) -> bool {
     path.extension().is_some_and(|e| e.eq_ignore_ascii_case("mcap")) && !path.is_dir()
 }
 
-fn create(path: &Path, manifest: &Manifest, force: bool) -> Result<Box<dyn EpisodeSink>, StorageError> {
-    Ok(Box::new(sink::McapSink::create(path, manifest, force)?))
+fn create(path: &Path, manifest: &Manifest, options: Options) -> Result<Box<dyn EpisodeSink>, StorageError> {
+    Ok(Box::new(sink::McapSink::create(path, manifest, options)?))
 }
 
 fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {

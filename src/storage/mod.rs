@@ -12,6 +12,8 @@ mod verify;
 
 use std::path::{Path, PathBuf};
 
+pub use parquet::PairsWriter;
+
 use crate::io::IoError;
 use crate::registry::Entry;
 use crate::schema::{Episode, Manifest, SchemaError};
@@ -29,8 +31,20 @@ pub const FORMATS: &[Entry<Format>] = &[mcap::ENTRY, parquet::ENTRY];
 /// Largest manifest that is read, bytes.
 const MANIFEST_LIMIT: u64 = 64 << 20;
 
-/// Starts a store at a path, for a manifest, with or without `force`.
-pub type Create = fn(&Path, &Manifest, bool) -> Result<Box<dyn EpisodeSink>, StorageError>;
+/// Metadata key of a table of pairs.
+const PAIRS_KEY: &str = "ccmarl.pairs";
+
+/// Starts a store at a path, for a manifest.
+pub type Create = fn(&Path, &Manifest, Options) -> Result<Box<dyn EpisodeSink>, StorageError>;
+
+/// How a store is written.
+#[derive(Clone, Copy, Debug)]
+pub struct Options {
+    /// Replace what ccmarl wrote under this name before.
+    pub force: bool,
+    /// Also write what viewers draw, where the format has viewers; the rollouts do not depend on it.
+    pub viewer: bool,
+}
 
 /// How a format is recognised, written and read.
 #[derive(Clone, Copy, Debug)]
@@ -161,16 +175,24 @@ pub enum StorageError {
     },
 }
 
-/// Starts a store at `path`; its extension chooses the format (`.mcap`, `.parquet`, anything else a directory of
-/// Parquet parts).
+/// Starts a store at `path`, with what viewers draw; its extension chooses the format (`.mcap`, `.parquet`, anything
+/// else a directory of Parquet parts).
 ///
 /// # Errors
 /// [`IoError::Exists`] without `force`; [`StorageError`] when the disk refuses.
 pub fn create(path: &Path, manifest: &Manifest, force: bool) -> Result<Box<dyn EpisodeSink>, StorageError> {
+    create_with(path, manifest, Options { force, viewer: true })
+}
+
+/// Starts a store at `path`, as [`create`] does, with options.
+///
+/// # Errors
+/// As [`create`].
+pub fn create_with(path: &Path, manifest: &Manifest, options: Options) -> Result<Box<dyn EpisodeSink>, StorageError> {
     check_name(path)?;
-    crate::io::refuse_existing(path, force)?;
+    crate::io::refuse_existing(path, options.force)?;
     crate::io::keep_freed_memory();
-    (format_of(path).build.create)(path, manifest, force)
+    (format_of(path).build.create)(path, manifest, options)
 }
 
 /// Opens the store at `path`.
@@ -227,7 +249,7 @@ fn start_partial(path: &Path, force: bool) -> Result<PathBuf, StorageError> {
 }
 
 /// Whether ccmarl made what stands at `path`: an empty directory or file, one with a rollout manifest, or a file that
-/// carries our metadata key in its last mebibyte.
+/// carries one of our metadata keys in its last mebibyte.
 fn is_ours(path: &Path) -> Result<bool, IoError> {
     use std::io::{Read as _, Seek as _, SeekFrom};
     if path.is_dir() {
@@ -243,8 +265,8 @@ fn is_ours(path: &Path) -> Result<bool, IoError> {
     let mut tail = Vec::new();
     file.seek(SeekFrom::Start(size.saturating_sub(1 << 20))).map_err(IoError::os("read", path))?;
     file.take(1 << 20).read_to_end(&mut tail).map_err(IoError::os("read", path))?;
-    let key = b"ccmarl.manifest";
-    Ok(size == 0 || tail.windows(key.len()).any(|w| w == key))
+    let holds = |key: &str| tail.windows(key.len()).any(|w| w == key.as_bytes());
+    Ok(size == 0 || holds("ccmarl.manifest") || holds(PAIRS_KEY))
 }
 
 /// The first format that claims the path; Parquet when none does.

@@ -32,13 +32,16 @@ mod encoder;
 mod group;
 mod journal;
 mod pages;
+mod pairs;
 mod salvage;
 mod sink;
 mod source;
 
 use std::path::Path;
 
-use super::{EpisodeSink, EpisodeSource, Format, StorageError};
+pub use pairs::PairsWriter;
+
+use super::{EpisodeSink, EpisodeSource, Format, Options, StorageError};
 use crate::registry::Entry;
 use crate::schema::Manifest;
 
@@ -68,8 +71,8 @@ fn is_single(path: &Path) -> bool {
     path.extension().is_some_and(|e| e.eq_ignore_ascii_case("parquet"))
 }
 
-fn create(path: &Path, manifest: &Manifest, force: bool) -> Result<Box<dyn EpisodeSink>, StorageError> {
-    Ok(Box::new(sink::ParquetSink::create(path, manifest, force)?))
+fn create(path: &Path, manifest: &Manifest, options: Options) -> Result<Box<dyn EpisodeSink>, StorageError> {
+    Ok(Box::new(sink::ParquetSink::create(path, manifest, options.force)?))
 }
 
 fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {

@@ -3,7 +3,7 @@
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
-use super::{StorageError, format_of, lock};
+use super::{Options, StorageError, format_of, lock};
 use crate::io::{self, IoError};
 use crate::schema::{Episode, Manifest};
 
@@ -108,7 +108,7 @@ pub fn recover(
     let mut name = std::ffi::OsString::from(".recovered.");
     name.push(target.file_name().unwrap_or("out".as_ref()));
     let built = target.with_file_name(name);
-    let mut sink = (format.create)(&built, &manifest, true)?;
+    let mut sink = (format.create)(&built, &manifest, Options { force: true, viewer: true })?;
     loop {
         match source.next_episode() {
             Ok(Some(episode)) => {

@@ -206,7 +206,12 @@ fn a_store_cut_anywhere_is_an_error_that_says_so() {
                 }
             }
             counts.dedup();
-            assert_eq!(counts, if form == "store.mcap" { vec![3, 2, 1, 0] } else { vec![3] });
+            let expected = match form {
+                "store.mcap" => vec![3, 2, 1, 0],
+                "store.parquet" => vec![3, 0], // without its end it is nothing
+                _ => vec![3],
+            };
+            assert_eq!(counts, expected);
             fs::write(&file, &whole).unwrap();
         }
         assert_eq!(read(&path).unwrap(), episodes);

@@ -7,13 +7,14 @@ use std::path::{Path, PathBuf};
 
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{McapError, WriteOptions, Writer};
-use prost::Message as _;
+use prost::Message;
 
-use super::proto::{self, DESCRIPTORS};
-use super::{EPISODE_TOPIC, JSON_KEY, MANIFEST_RECORD, RECORDING_RECORD, STEP_TOPIC};
+use super::proto::{self, DESCRIPTORS, VIEWER_DESCRIPTORS};
+use super::viewer::Viewer;
+use super::{EPISODE_TOPIC, JSON_KEY, MANIFEST_RECORD, POSES_TOPIC, RECORDING_RECORD, SCENE_TOPIC, STEP_TOPIC};
 use crate::io::{self, IoError};
 use crate::schema::{Episode, Layout, Manifest, STEP_SECS};
-use crate::storage::{EpisodeSink, StorageError, Tally, lock, start_partial};
+use crate::storage::{EpisodeSink, Options, StorageError, Tally, lock, start_partial};
 
 /// A store under construction, in the hidden sibling `.<name>.partial`.
 pub(super) struct McapSink {
@@ -23,8 +24,9 @@ pub(super) struct McapSink {
     manifest: Manifest,
     layout: Layout,
     writer: Writer<BufWriter<File>>,
-    step_channel: u16,
-    episode_channel: u16,
+    channels: Channels,
+    /// What is drawn, unless it was not asked for, or cannot be.
+    viewer: Option<Viewer>,
     /// Reused from row to row; the agents' names stay.
     row: proto::Step,
     bytes: Vec<u8>,
@@ -34,27 +36,27 @@ pub(super) struct McapSink {
 
 impl McapSink {
     /// Starts a store at `path`.
-    pub(super) fn create(path: &Path, manifest: &Manifest, force: bool) -> Result<Self, StorageError> {
+    pub(super) fn create(path: &Path, manifest: &Manifest, options: Options) -> Result<Self, StorageError> {
         let layout = manifest.layout();
         let schema = |source| StorageError::Schema { source, path: path.to_owned() };
         layout.check().map_err(schema)?;
         let unsealed = Manifest { parts: Vec::new(), ..manifest.clone() }.sealed_json().map_err(schema)?;
-        let partial = start_partial(path, force)?;
+        let partial = start_partial(path, options.force)?;
         let file = File::create_new(&partial).map_err(IoError::os("create", &partial))?;
         lock::hold_file(&file, &partial)?;
-        let started = start(file, unsealed).map_err(|e| refused(e, &partial))?;
-        let (writer, step_channel, episode_channel) = started;
+        let viewer = if options.viewer { Viewer::new(manifest, &layout) } else { None };
+        let (writer, channels) = start(file, unsealed, viewer.is_some()).map_err(|e| refused(e, &partial))?;
         let agents = layout.agents.iter().map(|a| proto::Agent { name: a.name.clone(), ..proto::Agent::default() });
         let row = proto::Step { agents: agents.collect(), ..proto::Step::default() };
         Ok(Self {
             path: path.to_owned(),
             partial,
-            force,
+            force: options.force,
             manifest: manifest.clone(),
             layout,
             writer,
-            step_channel,
-            episode_channel,
+            channels,
+            viewer,
             row,
             bytes: Vec::new(),
             total: Tally::default(),
@@ -62,13 +64,13 @@ impl McapSink {
         })
     }
 
-    /// Fills the reused message with row `r`.
-    fn fill(&mut self, e: &Episode, r: usize) {
+    /// Fills a reused message with row `r`.
+    fn fill(&self, row: &mut proto::Step, e: &Episode, r: usize) {
         fn copy<T: Copy>(out: &mut Vec<T>, values: &[T], row: usize, width: usize) {
             out.clear();
             out.extend_from_slice(&values[row * width..(row + 1) * width]);
         }
-        let (row, acted) = (&mut self.row, r < e.steps);
+        let acted = r < e.steps;
         let n = self.layout.communicators().len();
         (row.episode, row.step) = (e.index, r as u32);
         (row.is_first, row.is_last, row.is_terminal) = (r == 0, !acted, !acted && e.terminal);
@@ -86,29 +88,50 @@ impl McapSink {
         }
     }
 
-    fn write(&mut self, channel_id: u16, sequence: usize, row: u64) -> Result<(), StorageError> {
+    /// Writes a message. `row` counts through all episodes.
+    fn write(&mut self, channel_id: u16, step: usize, row: u64, message: &impl Message) -> Result<(), StorageError> {
+        self.bytes.clear();
+        message.encode(&mut self.bytes).map_err(|e| refused(std::io::Error::other(e).into(), &self.partial))?;
         // Nothing is delayed: a message is delivered, or lost, in the step in which it was sent.
-        let time = row.saturating_mul((STEP_SECS * 1e9) as u64);
-        let header = MessageHeader { channel_id, sequence: sequence as u32, log_time: time, publish_time: time };
+        let (log_time, publish_time) = (time(row), time(row));
+        let header = MessageHeader { channel_id, sequence: step as u32, log_time, publish_time };
         self.writer.write_to_known_channel(&header, &self.bytes).map_err(|e| refused(e, &self.partial))
     }
 }
 
+/// Nanoseconds from the start of the file to a row.
+fn time(row: u64) -> u64 {
+    row.saturating_mul((STEP_SECS * 1e9) as u64)
+}
+
+/// Channels of the topics.
+struct Channels {
+    step: u16,
+    episode: u16,
+    scene: u16,
+    poses: u16,
+}
+
 /// Header, first metadata record, schemas, channels.
-fn start(file: File, unsealed: String) -> Result<(Writer<BufWriter<File>>, u16, u16), McapError> {
+fn start(file: File, unsealed: String, viewer: bool) -> Result<(Writer<BufWriter<File>>, Channels), McapError> {
     let mut writer = WriteOptions::new()
         .library(concat!("ccmarl/", env!("CARGO_PKG_VERSION")))
         .disable_seeking(true) // a chunk appears whole, so a kill leaves no half one
         .compression_threads(0) // more threads give other bytes
         .create(BufWriter::with_capacity(1 << 18, file))?;
     writer.write_metadata(&record(RECORDING_RECORD, unsealed))?;
-    let mut channel = |topic, message| {
-        let schema = writer.add_schema(message, "protobuf", DESCRIPTORS)?;
+    let mut channel = |topic, message, descriptors| {
+        let schema = writer.add_schema(message, "protobuf", descriptors)?;
         writer.add_channel(schema, topic, "protobuf", &BTreeMap::new())
     };
-    let step = channel(STEP_TOPIC, "ccmarl.v1.Step")?;
-    let episode = channel(EPISODE_TOPIC, "ccmarl.v1.Episode")?;
-    Ok((writer, step, episode))
+    let step = channel(STEP_TOPIC, "ccmarl.v1.Step", DESCRIPTORS)?;
+    let episode = channel(EPISODE_TOPIC, "ccmarl.v1.Episode", DESCRIPTORS)?;
+    let (mut scene, mut poses) = (0, 0);
+    if viewer {
+        scene = channel(SCENE_TOPIC, "foxglove.SceneUpdate", VIEWER_DESCRIPTORS)?;
+        poses = channel(POSES_TOPIC, "foxglove.PosesInFrame", VIEWER_DESCRIPTORS)?;
+    }
+    Ok((writer, Channels { step, episode, scene, poses }))
 }
 
 fn record(name: &str, json: String) -> Metadata {
@@ -120,12 +143,19 @@ impl EpisodeSink for McapSink {
         let schema = |source| StorageError::Schema { source, path: self.path.clone() };
         let hash = self.total.check(&self.layout, episode).map_err(schema)?;
         let before = self.total.steps + self.total.episodes;
+        let mut row = std::mem::take(&mut self.row);
         for r in 0..episode.rows() {
-            self.fill(episode, r);
-            self.bytes.clear();
-            self.row.encode(&mut self.bytes).map_err(|e| refused(std::io::Error::other(e).into(), &self.partial))?;
-            self.write(self.step_channel, r, before + r as u64)?;
+            let at = before + r as u64;
+            self.fill(&mut row, episode, r);
+            self.write(self.channels.step, r, at, &row)?;
+            if let Some(viewer) = &self.viewer {
+                let (scene, poses) =
+                    (viewer.scene(&row.state, &row.link, time(at)), viewer.poses(&row.state, time(at)));
+                self.write(self.channels.scene, r, at, &scene)?;
+                self.write(self.channels.poses, r, at, &poses)?;
+            }
         }
+        self.row = row;
         let end = proto::Episode {
             index: episode.index,
             steps: episode.steps as u64,
@@ -133,9 +163,7 @@ impl EpisodeSink for McapSink {
             episode_return: episode.episode_return(),
             content_hash: hash.to_vec(),
         };
-        self.bytes.clear();
-        end.encode(&mut self.bytes).map_err(|e| refused(std::io::Error::other(e).into(), &self.partial))?;
-        self.write(self.episode_channel, episode.steps, before + episode.steps as u64)?;
+        self.write(self.channels.episode, episode.steps, before + episode.steps as u64, &end)?;
         self.writer.flush().map_err(|e| refused(e, &self.partial))?;
         self.total.add(episode, &hash);
         Ok(())

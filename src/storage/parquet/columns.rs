@@ -16,7 +16,7 @@ use parquet::schema::types::ColumnPath;
 use crate::schema::{AgentSpec, Episode, Layout};
 
 /// Name of the elements of a list, as pyarrow and the Parquet standard write it.
-const ELEMENT: &str = "element";
+pub(super) const ELEMENT: &str = "element";
 
 /// Values that the encoder takes at once; the crate's 1024 costs more calls.
 const WRITE_BATCH: usize = 1 << 16;
@@ -91,6 +91,7 @@ pub(super) fn properties(schema: &Schema) -> WriterProperties {
             DataType::Int32 | DataType::Int64 => builder
                 .set_column_encoding(path.clone(), Encoding::DELTA_BINARY_PACKED)
                 .set_column_statistics_enabled(path, EnabledStatistics::Chunk),
+            DataType::Utf8 => builder.set_column_dictionary_enabled(path, true),
             _ => builder.set_column_encoding(path, Encoding::PLAIN),
         };
     }

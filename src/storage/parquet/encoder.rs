@@ -181,7 +181,8 @@ fn temporary(path: &Path) -> PathBuf {
     path.with_extension("parquet.tmp")
 }
 
-fn refused(error: ParquetError, path: &Path) -> StorageError {
+/// A Parquet error as one of the store; `path` is where it happened.
+pub(super) fn refused(error: ParquetError, path: &Path) -> StorageError {
     match error {
         ParquetError::External(source) => match source.downcast::<std::io::Error>() {
             Ok(source) => IoError::os("write", path)(*source).into(),

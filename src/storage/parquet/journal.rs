@@ -41,6 +41,9 @@ impl Journal {
 
     /// Appends episodes as one batch; they are safe after the next [`Journal::flush`].
     pub(super) fn write(&mut self, layout: &Layout, episodes: &[Episode]) -> Result<(), StorageError> {
+        if episodes.is_empty() {
+            return Ok(());
+        }
         let mut block = Block::new(layout, episodes.iter().map(Episode::rows).sum());
         for episode in episodes {
             block.push(layout, episode);
