@@ -5,6 +5,8 @@ mod architecture;
 mod cli;
 mod estimate_mi;
 mod figures;
+mod fuzz;
+mod integrity;
 mod links;
 mod mi;
 mod record;
