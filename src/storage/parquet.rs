@@ -87,6 +87,10 @@ fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
     }
 }
 
+pub(super) fn check_table(path: &Path) -> Result<(), StorageError> {
+    source::check_table(path)
+}
+
 fn salvage(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
     Ok(Box::new(salvage::Leftover::open(path)?))
 }
