@@ -42,7 +42,7 @@ deny:
 tables:
     python3 datasets/tables/make.py
 
-# The stores in other people's readers: pyarrow, polars, duckdb, mcap (needs python3 with venv, and PyPI)
+# The stores in other people's readers: pyarrow, polars, duckdb, pandas, datasets, mcap, foxglove, rerun, pymcap-cli (needs python3 with venv, and PyPI)
 interop:
     tests/interop/run.sh
 

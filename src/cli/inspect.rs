@@ -1,21 +1,51 @@
 //! `ccmarl inspect STORE`: what a store holds, how it was made, its returns, sums and realised loss rates.
 
+mod counts;
+
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use serde_json::Value;
 
 use super::{Outcome, ui};
 use crate::Error;
-use crate::schema::{AgentSpec, Episode, Layout, Manifest, Matrix};
-use crate::storage;
+use crate::io::{read_text, refuse_existing, write_atomic};
+use crate::schema::AgentSpec;
+use crate::stats::{mean, sd};
+use crate::storage::{self, StorageError};
+use counts::{Counts, Part, episodes, merge, parse_shard};
+
+const EXAMPLES: &str = "\
+Examples:
+  ccmarl inspect data/tag
+  ccmarl inspect data/tag --shard 3/16 --out parts/3.json
+  ccmarl inspect --merge parts/*.json
+
+Shards i/n count from 0. Merged in any order they print what one pass over the store prints, to the last bit.";
+
+/// Largest part file that is read, bytes.
+const PART_LIMIT: u64 = 4 << 30;
 
 /// Show what a recorded store holds
 #[derive(Debug, clap::Args)]
+#[command(after_help = EXAMPLES)]
 pub(super) struct Args {
     /// A directory, .parquet or .mcap file that `ccmarl record` made
-    store: PathBuf,
+    #[arg(required_unless_present = "merge")]
+    store: Option<PathBuf>,
+    /// Count only the i-th of n shards of the episodes
+    #[arg(long, value_name = "I/N", requires = "out", value_parser = parse_shard)]
+    shard: Option<[u64; 2]>,
+    /// File for the counts of the shard
+    #[arg(long, value_name = "PART", requires = "shard")]
+    out: Option<PathBuf>,
+    /// Put the counts of all shards together, in any order
+    #[arg(long, value_name = "PART", num_args = 1.., conflicts_with_all = ["store", "shard"])]
+    merge: Vec<PathBuf>,
+    /// Replace the file of --out
+    #[arg(long)]
+    force: bool,
     /// How to print
     #[arg(long, value_enum, default_value_t)]
     format: ui::Format,
@@ -68,83 +98,26 @@ struct Loss {
     rate: Option<f64>,
 }
 
-/// Counts that grow by one episode at a time.
-struct Counter {
-    layout: Layout,
-    communicators: Vec<usize>,
-    returns: Vec<f64>,
-    agent_returns: Vec<f64>,
-    terminal: u64,
-    steps: u64,
-    sums: BTreeMap<String, f64>,
-    lost: Vec<u64>,
-}
-
-impl Counter {
-    fn new(layout: Layout) -> Self {
+impl Summary {
+    fn new(part: &Part) -> Self {
+        let (counts, manifest) = (&part.counts, &part.manifest);
+        let layout = manifest.layout();
         let communicators = layout.communicators();
-        let n = communicators.len();
-        let agent_returns = vec![0.0; layout.agents.len()];
-        let (returns, sums, lost) = (Vec::new(), BTreeMap::new(), vec![0; n * n]);
-        Self { layout, communicators, returns, agent_returns, terminal: 0, steps: 0, sums, lost }
-    }
-
-    fn add(&mut self, e: &Episode) {
-        let (n, t) = (self.communicators.len(), e.steps);
-        self.returns.push(e.episode_return());
-        self.terminal += u64::from(e.terminal);
-        self.steps += t as u64;
-        let mut sum = |column: String, value: f64| *self.sums.entry(column).or_default() += value;
-        let total = |data: &[f32]| data.iter().map(|&v| f64::from(v)).sum::<f64>();
-        sum("episode".to_owned(), e.index as f64 * e.rows() as f64);
-        sum("step".to_owned(), (t * (t + 1)) as f64 / 2.0);
-        sum("reward".to_owned(), total(&e.reward));
-        if !self.layout.state_fields.is_empty() {
-            sum("state".to_owned(), e.state.iter().sum());
-        }
-        if n > 0 {
-            sum("link".to_owned(), e.link.iter().filter(|&&b| b).count() as f64);
-        }
-        for (i, agent) in self.layout.agents.iter().enumerate() {
-            let mut matrix = |kind: &str, m: &Matrix| {
-                if m.width > 0 {
-                    sum(format!("{kind}.{}", agent.name), total(&m.data));
-                }
-            };
-            matrix("observation", &e.observations[i]);
-            matrix("message", &e.messages[i]);
-            matrix("action", &e.actions[i]);
-            let reward = total(&e.rewards[i]);
-            sum(format!("reward.{}", agent.name), reward);
-            self.agent_returns[i] += reward;
-        }
-        for bits in e.link[..t * n * n].chunks_exact((n * n).max(1)) {
-            self.lost.iter_mut().zip(bits).for_each(|(lost, &delivered)| *lost += u64::from(!delivered));
-        }
-    }
-
-    fn summary(self, store: String, manifest: &Manifest) -> Summary {
-        let (n, episodes) = (self.communicators.len(), self.returns.len() as f64);
-        let name = |c: usize| self.layout.agents[self.communicators[c]].name.clone();
+        let (n, all) = (communicators.len(), counts.returns());
+        let episodes = all.len() as f64;
+        let name = |c: usize| layout.agents[communicators[c]].name.clone();
         let pairs = (0..n).flat_map(|s| (0..n).filter(move |&r| r != s).map(move |r| (s, r)));
         let rate = |lost: u64, steps: u64| (steps > 0).then(|| lost as f64 / steps as f64);
         let loss: Vec<Loss> = pairs
             .map(|(s, r)| {
-                let lost = self.lost[s * n + r];
-                Loss { sender: name(s), receiver: name(r), steps: self.steps, lost, rate: rate(lost, self.steps) }
+                let (lost, steps) = (counts.lost[s * n + r], counts.steps);
+                Loss { sender: name(s), receiver: name(r), steps, lost, rate: rate(lost, steps) }
             })
             .collect();
-        let mean = self.returns.iter().sum::<f64>() / episodes;
-        let squares: f64 = self.returns.iter().map(|r| (r - mean) * (r - mean)).sum();
-        let returns = Spread {
-            mean,
-            sd: (episodes > 1.0).then(|| (squares / (episodes - 1.0)).sqrt()),
-            min: self.returns.iter().copied().fold(f64::INFINITY, f64::min),
-            max: self.returns.iter().copied().fold(f64::NEG_INFINITY, f64::max),
-        };
-        let agents = self.layout.agents.iter().map(|a| a.name.clone());
-        Summary {
-            store,
+        let sums = counts.sums();
+        let agent_return = |name: &str| sums.get(&format!("reward.{name}")).copied().unwrap_or(0.0) / episodes;
+        Self {
+            store: part.store.clone(),
             schema_version: manifest.schema_version,
             ccmarl: manifest.ccmarl.clone(),
             seed: manifest.seed,
@@ -156,10 +129,15 @@ impl Counter {
             files: manifest.parts.len().max(1),
             episodes: manifest.episodes,
             steps: manifest.steps,
-            terminal_episodes: self.terminal,
-            returns,
-            agent_returns: agents.zip(self.agent_returns.iter().map(|r| r / episodes)).collect(),
-            sums: self.sums,
+            terminal_episodes: counts.terminal,
+            returns: Spread {
+                mean: mean(&all),
+                sd: (all.len() > 1).then(|| sd(&all)),
+                min: all.iter().copied().fold(f64::INFINITY, f64::min),
+                max: all.iter().copied().fold(f64::NEG_INFINITY, f64::max),
+            },
+            agent_returns: layout.agents.iter().map(|a| (a.name.clone(), agent_return(&a.name))).collect(),
+            sums,
             loss_rate: rate(loss.iter().map(|l| l.lost).sum(), loss.iter().map(|l| l.steps).sum()),
             loss,
         }
@@ -168,20 +146,56 @@ impl Counter {
 
 /// Runs the command. Memory is one episode and one number per episode.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
-    let mut source = storage::open(&args.store).map_err(Error::from)?;
-    let mut counter = Counter::new(source.manifest().layout());
-    let bar = ui::progress(source.manifest().episodes, "reading");
-    while let Some(episode) = source.next_episode().map_err(Error::from)? {
-        counter.add(&episode);
-        bar.inc(1);
-    }
-    bar.finish_and_clear();
-    let summary = counter.summary(args.store.display().to_string(), source.manifest());
+    let whole = if let Some(store) = &args.store {
+        if let Some(out) = &args.out {
+            refuse_existing(out, args.force).map_err(Error::from)?;
+        }
+        let shard = args.shard.unwrap_or([0, 1]);
+        let part = count(store, shard).map_err(Error::from)?;
+        if let Some(out) = &args.out {
+            write_atomic(out, serde_json::to_string(&part)?.as_bytes()).map_err(Error::from)?;
+            let [from, to] = episodes(shard, part.manifest.episodes);
+            ui::say(&format!("wrote the counts of episodes {from} to {to} (not included): {}", out.display()));
+            return Ok(Outcome::Done);
+        }
+        part
+    } else {
+        let mut parts = Vec::new();
+        for path in &args.merge {
+            let text = read_text(path, PART_LIMIT).map_err(Error::from)?;
+            let part = Part::parse(&text).map_err(|message| anyhow::anyhow!("{message}: {}", path.display()));
+            parts.push(part?);
+        }
+        merge(parts)?
+    };
+    let summary = Summary::new(&whole);
     match args.format {
         ui::Format::Json => ui::print_json(&summary)?,
         ui::Format::Table => print_tables(&summary)?,
     }
     Ok(Outcome::Done)
+}
+
+/// Counts the episodes of a shard.
+fn count(store: &Path, shard: [u64; 2]) -> Result<Part, StorageError> {
+    let mut source = storage::open(store)?;
+    let layout = source.manifest().layout();
+    let mut counts = Counts::new(&layout);
+    let [from, to] = episodes(shard, source.manifest().episodes);
+    let bar = ui::progress(to - from, "reading");
+    if from < to {
+        source.skip_to(from)?;
+    }
+    for _ in from..to {
+        let Some(episode) = source.next_episode()? else { break };
+        counts.add(&layout, &episode);
+        bar.inc(1);
+    }
+    if to == source.manifest().episodes && from < to {
+        source.next_episode()?; // at its end a source compares what it read with the manifest
+    }
+    bar.finish_and_clear();
+    Ok(Part::new(store.display().to_string(), shard, source.manifest().clone(), counts))
 }
 
 fn print_tables(s: &Summary) -> anyhow::Result<()> {

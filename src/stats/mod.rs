@@ -3,8 +3,10 @@
 //! The unit of a comparison is the seed (one training run), never the episode. Every interval is two-sided.
 
 mod bootstrap;
+mod exact;
 
 pub use bootstrap::{bootstrap_interval, stratified_interval};
+pub use exact::ExactSum;
 
 use statrs::distribution::{ContinuousCDF as _, StudentsT};
 

@@ -103,6 +103,20 @@ pub trait EpisodeSource: Send {
     /// # Errors
     /// [`StorageError`] when data is damaged, missing or against the schema.
     fn next_episode(&mut self) -> Result<Option<Episode>, StorageError>;
+
+    /// Goes on to episode number `episode` without returning those before. A directory passes over whole parts without
+    /// opening them.
+    ///
+    /// # Errors
+    /// As [`EpisodeSource::next_episode`].
+    fn skip_to(&mut self, episode: u64) -> Result<(), StorageError> {
+        for _ in 0..episode {
+            if self.next_episode()?.is_none() {
+                break;
+            }
+        }
+        Ok(())
+    }
 }
 
 /// What goes wrong with a store. The path comes last.

@@ -1,80 +1,87 @@
-"""Reads rollout stores with pyarrow, polars, duckdb and mcap, and compares the sum of every column with what
-`ccmarl inspect --format json` prints.
+"""Reads rollout stores with other people's readers and compares every value with what `ccmarl inspect` says: the sum
+of each column, and the content digest, which is recomputed here from the values that each reader gives.
 
 usage: read_stores.py INSPECT_JSON STORE...   (STORE: a directory, a .parquet or a .mcap file of the same rollouts)
 
 Prints one `ok` line per reader and store; exit 1 on the first difference.
 """
 
+import hashlib
 import json
 import math
 import sys
 from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
 
 
 def parquet_files(store: Path) -> list[str]:
     return [str(p) for p in sorted(store.glob("part-*.parquet"))] if store.is_dir() else [str(store)]
 
 
-def with_pyarrow(store: Path) -> dict[str, float]:
-    import pyarrow as pa
-    import pyarrow.compute as pc
+def rows_of(column) -> np.ndarray:
+    """The rows of an Arrow column that are not null, [rows, width]."""
+    column = column.drop_null()
+    if isinstance(column, pa.ChunkedArray):
+        column = column.combine_chunks()
+    rows = len(column)
+    if pa.types.is_nested(column.type):
+        column = column.flatten()
+    values = column.to_numpy(zero_copy_only=False)
+    return values.reshape(rows, -1)
+
+
+def with_pyarrow(store: Path) -> dict[str, np.ndarray]:
     import pyarrow.parquet as pq
 
     table = pa.concat_tables([pq.read_table(f) for f in parquet_files(store)])
-    sums = {}
-    for name in table.column_names:
-        column = table[name].combine_chunks()
-        kind = column.type
-        if pa.types.is_fixed_size_list(kind):
-            column = column.drop_null().flatten()
-        if pa.types.is_float32(column.type):
-            column = column.cast(pa.float64())
-        sums[name] = pc.sum(column).as_py() or 0
-    return sums
+    return {name: rows_of(table[name]) for name in table.column_names}
 
 
-def with_polars(store: Path) -> dict[str, float]:
+def with_polars(store: Path) -> dict[str, np.ndarray]:
     import polars as pl
 
     frame = pl.read_parquet(parquet_files(store))
-    sums = {}
-    for name, kind in frame.schema.items():
-        column = frame[name].drop_nulls()
-        if isinstance(kind, pl.Array):
-            column = column.explode()
-        sums[name] = column.cast(pl.Float64).sum()
-    return sums
+    columns = {name: frame[name].drop_nulls() for name in frame.columns}
+    return {name: column.to_numpy().reshape(len(column), -1) for name, column in columns.items()}
 
 
-def with_duckdb(store: Path) -> dict[str, float]:
+def with_duckdb(store: Path) -> dict[str, np.ndarray]:
     import duckdb
 
-    base = duckdb.connect()
-    files = parquet_files(store)
-    columns = base.execute("describe select * from read_parquet(?)", [files]).fetchall()
-    sums = {}
-    for name, kind, *_ in columns:
-        quoted = '"' + name.replace('"', '""') + '"'
-        if kind.endswith("[]") or "[" in kind:
-            inner = f"select unnest({quoted}) as v from read_parquet(?)"
-        else:
-            inner = f"select {quoted} as v from read_parquet(?)"
-        value = base.execute(f"select sum(v::double) from ({inner})", [files]).fetchone()[0]
-        sums[name] = value or 0
-    return sums
+    query = "select * from read_parquet(?) order by episode, step"
+    table = duckdb.sql(query, params=[parquet_files(store)]).to_arrow_table()
+    return {name: rows_of(table[name]) for name in table.column_names}
 
 
-def with_mcap(store: Path) -> dict[str, float]:
+def with_pandas(store: Path) -> dict[str, np.ndarray]:
+    import pandas as pd
+
+    frame = pd.concat([pd.read_parquet(f) for f in parquet_files(store)])
+    columns = {name: frame[name].dropna() for name in frame.columns}
+    return {name: np.stack(list(c)).reshape(len(c), -1) for name, c in columns.items()}
+
+
+def with_datasets(store: Path) -> dict[str, np.ndarray]:
+    import datasets
+
+    datasets.disable_progress_bars()
+    files = [str(Path(f).absolute()) for f in parquet_files(store)]
+    table = datasets.Dataset.from_parquet(files, cache_dir="/nonexistent", keep_in_memory=True).data.table
+    return {name: rows_of(table[name]) for name in table.column_names}
+
+
+def with_mcap(store: Path) -> dict[str, np.ndarray]:
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
     from mcap.reader import make_reader
 
     classes = {}
-    sums: dict[str, float] = {"link": 0.0, "state": 0.0, "reward": 0.0, "episode": 0.0, "step": 0.0}
+    lists: dict[str, list] = {}
     rows, ends, steps, last_time = 0, 0, 0, -1
 
     def add(name: str, values) -> None:
-        sums[name] = sums.get(name, 0.0) + math.fsum(values)
+        lists.setdefault(name, []).append(values)
 
     with store.open("rb") as file:
         for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
@@ -89,41 +96,66 @@ def with_mcap(store: Path) -> dict[str, float]:
             last_time = message.log_time
             if channel.topic == "/rollout/episode":
                 ends, steps = ends + 1, steps + data.steps
+            if channel.topic != "/rollout/step":
                 continue
-            assert channel.topic == "/rollout/step" and message.sequence == data.step
+            assert message.sequence == data.step
             rows += 1
             add("episode", [data.episode])
             add("step", [data.step])
-            add("state", data.state)
-            add("link", data.link)
+            add("is_terminal", [data.is_terminal])
+            add("state", np.array(data.state))
+            add("link", np.array(data.link, dtype=bool))
             if data.HasField("reward"):
-                add("reward", [data.reward])
+                add("reward", np.float32([data.reward]))
             for agent in data.agents:
                 for kind in ("observation", "message", "action"):
-                    values = getattr(agent, kind)
-                    if values:
-                        add(f"{kind}.{agent.name}", values)
+                    if values := getattr(agent, kind):
+                        add(f"{kind}.{agent.name}", np.array(values, dtype=np.float32))
                 if agent.HasField("reward"):
-                    add(f"reward.{agent.name}", [agent.reward])
+                    add(f"reward.{agent.name}", np.float32([agent.reward]))
     assert rows == steps + ends, f"{rows} rows for {ends} episodes of {steps} steps"
-    return sums
+    return {name: np.stack(values) for name, values in lists.items()}
 
 
-def compare(reader: str, store: Path, expected: dict[str, float], found: dict[str, float]) -> None:
-    for column, value in expected.items():
-        if column not in found:
-            sys.exit(f"{reader}: {store}: column {column} is missing")
-        if not math.isclose(value, float(found[column]), rel_tol=1e-9, abs_tol=1e-6):
-            sys.exit(f"{reader}: {store}: sum of {column}: inspect says {value}, found {found[column]}")
-    print(f"ok {reader} {store}: {len(expected)} columns")
+def content(columns: dict[str, np.ndarray], agents: list[dict]) -> str:
+    """The digest over the content hashes of all episodes; Episode::content_hash says over what."""
+    names = [agent["name"] for agent in agents]
+    kinds = ["state", *(f"observation.{n}" for n in names), *(f"message.{n}" for n in names), "link"]
+    acted = [*(f"action.{n}" for n in names), "reward", *(f"reward.{n}" for n in names)]
+    last = np.append(np.flatnonzero(columns["step"][1:, 0] == 0), len(columns["step"]) - 1)
+    total = hashlib.sha256()
+    row = 0
+    for episode, end in enumerate(last + 1):
+        steps = end - row - 1
+        terminal = bool(columns["is_terminal"][end - 1, 0])
+        one = hashlib.sha256(b"ccmarl episode v1" + int(steps).to_bytes(8, "little") + bytes([terminal]))
+        for names, first, count in ((kinds, row, steps + 1), (acted, row - episode, steps)):
+            for name in names:
+                if name in columns:
+                    kind = {"state": "<f8", "link": "u1"}.get(name, "<f4")
+                    one.update(columns[name][first : first + count].astype(kind, copy=False).tobytes())
+        total.update(one.digest())
+        row = end
+    return total.hexdigest()
+
+
+def compare(reader: str, store: Path, inspected: dict, columns: dict[str, np.ndarray]) -> None:
+    for column, value in inspected["sums"].items():
+        found = columns[column].sum(dtype=np.float64) if column in columns else 0.0
+        if not math.isclose(value, float(found), rel_tol=1e-9, abs_tol=1e-6):
+            sys.exit(f"{reader}: {store}: sum of {column}: inspect says {value}, found {found}")
+    digest = content(columns, inspected["agents"])
+    if digest != inspected["content"]:
+        sys.exit(f"{reader}: {store}: content: inspect says {inspected['content']}, found {digest}")
+    print(f"ok {reader} {store}: {len(inspected['sums'])} columns, content {digest[:16]}…")
 
 
 def main() -> None:
-    expected = json.loads(Path(sys.argv[1]).read_text())["sums"]
+    inspected = json.loads(Path(sys.argv[1]).read_text())
     for store in map(Path, sys.argv[2:]):
-        readers = [with_mcap] if store.suffix == ".mcap" else [with_pyarrow, with_polars, with_duckdb]
-        for reader in readers:
-            compare(reader.__name__.removeprefix("with_"), store, expected, reader(store))
+        parquet = [with_pyarrow, with_polars, with_duckdb, with_pandas, with_datasets]
+        for reader in [with_mcap] if store.suffix == ".mcap" else parquet:
+            compare(reader.__name__.removeprefix("with_"), store, inspected, reader(store))
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@
 mod architecture;
 mod cli;
 mod estimate_mi;
+mod extracts;
 mod figures;
 mod fuzz;
 mod integrity;

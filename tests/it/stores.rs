@@ -146,6 +146,13 @@ fn long_recordings_are_cut_into_parts_of_whole_episodes() {
     let ranges: Vec<[u64; 2]> = manifest.parts.iter().map(|p| p.episodes).collect();
     assert_eq!(ranges, [[0, 4000], [4000, 8000], [8000, 9000]]);
     assert!(read(&path).unwrap() == episodes);
+    // blocks that end where a part ends, and one that spans two parts, give the same files
+    let blocks = directory.path().join("blocks");
+    let mut sink = storage::create(&blocks, &self::manifest(&layout), false).unwrap();
+    for range in [0..2000, 2000..4000, 4000..4000, 4000..9000] {
+        sink.append_all(&episodes[range]).unwrap();
+    }
+    assert_eq!(sink.finish().unwrap(), manifest);
     let mut names: Vec<_> = fs::read_dir(&path).unwrap().map(|e| e.unwrap().file_name()).collect();
     names.sort();
     assert_eq!(names, ["manifest.json", "part-00000.parquet", "part-00001.parquet", "part-00002.parquet"]);

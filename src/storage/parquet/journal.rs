@@ -42,7 +42,7 @@ impl Journal {
     /// Appends episodes as one batch; they are safe after the next [`Journal::flush`].
     pub(super) fn write(&mut self, layout: &Layout, episodes: &[Episode]) -> Result<(), StorageError> {
         if episodes.is_empty() {
-            return Ok(());
+            return Ok(()); // a batch of no rows has no lists
         }
         let mut block = Block::new(layout, episodes.iter().map(Episode::rows).sum());
         for episode in episodes {

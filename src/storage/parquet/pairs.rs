@@ -2,7 +2,6 @@
 //!
 //! Not a store: it is written here because only this room writes Parquet.
 
-use std::fs::File;
 use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -13,6 +12,7 @@ use arrow::array::{
 use arrow::buffer::NullBuffer;
 use arrow::datatypes::{DataType, Field, Schema, SchemaRef};
 use arrow::error::ArrowError;
+use atomic_write_file::AtomicWriteFile;
 use parquet::arrow::ArrowWriter;
 use parquet::errors::ParquetError;
 use parquet::file::metadata::KeyValue;
@@ -21,7 +21,7 @@ use super::columns::{ELEMENT, properties};
 use super::encoder::refused;
 use crate::io::{self, IoError};
 use crate::schema::{Episode, Layout, Manifest, Matrix};
-use crate::storage::{PAIRS_KEY, StorageError, start_partial};
+use crate::storage::{PAIRS_KEY, StorageError, is_ours};
 
 /// Rows that are encoded at once.
 const BLOCK_ROWS: usize = 8192;
@@ -35,12 +35,10 @@ const GROUP_ROWS: usize = 1 << 17;
 /// agents differ in width, the elements that an agent does not have are null.
 pub struct PairsWriter {
     path: PathBuf,
-    partial: PathBuf,
-    force: bool,
     layout: Layout,
     schema: SchemaRef,
     /// `None` once it is closed.
-    writer: Option<ArrowWriter<BufWriter<File>>>,
+    writer: Option<ArrowWriter<BufWriter<AtomicWriteFile>>>,
     block: Block,
     rows: u64,
 }
@@ -67,13 +65,17 @@ impl PairsWriter {
         let schema = Arc::new(Schema::new(fields));
         let json = Manifest { parts: Vec::new(), ..manifest.clone() }.sealed_json();
         let json = json.map_err(|source| StorageError::Schema { source, path: path.to_owned() })?;
-        let partial = start_partial(path, force)?;
-        let file = File::create_new(&partial).map_err(IoError::os("create", &partial))?;
+        io::refuse_existing(path, force)?;
+        if path.symlink_metadata().is_ok() && (path.is_dir() || !is_ours(path)?) {
+            return Err(IoError::Foreign(path.to_owned()).into());
+        }
+        io::create_parent(path)?;
+        let file = AtomicWriteFile::open(path).map_err(IoError::os("create", path))?;
         let file = BufWriter::with_capacity(1 << 18, file);
         let mut writer = ArrowWriter::try_new(file, SchemaRef::clone(&schema), Some(properties(&schema)))
-            .map_err(|e| refused(e, &partial))?;
+            .map_err(|e| refused(e, path))?;
         writer.append_key_value_metadata(KeyValue::new(PAIRS_KEY.to_owned(), json));
-        Ok(Self { path: path.to_owned(), partial, force, layout, schema, writer: Some(writer), block, rows: 0 })
+        Ok(Self { path: path.to_owned(), layout, schema, writer: Some(writer), block, rows: 0 })
     }
 
     /// Appends the pairs of an episode.
@@ -114,7 +116,7 @@ impl PairsWriter {
         let written = batch.and_then(|batch| writer.write(&batch));
         self.rows += rows;
         let ended = if writer.in_progress_rows() >= GROUP_ROWS { writer.flush() } else { Ok(()) };
-        written.and(ended).map_err(|e| refused(e, &self.partial))
+        written.and(ended).map_err(|e| refused(e, &self.path))
     }
 
     /// Puts the table under its name; returns its rows.
@@ -124,18 +126,10 @@ impl PairsWriter {
     pub fn finish(mut self) -> Result<u64, StorageError> {
         self.write_block()?;
         let Some(writer) = self.writer.take() else { return Ok(self.rows) };
-        let file = writer.into_inner().map_err(|e| refused(e, &self.partial))?;
-        let file = file.into_inner().map_err(|e| IoError::os("write", &self.partial)(e.into_error()))?;
-        file.sync_all().map_err(IoError::os("sync", &self.partial))?;
-        io::publish(&self.partial, &self.path, self.force, super::MANIFEST_FILE)?;
+        let file = writer.into_inner().map_err(|e| refused(e, &self.path))?;
+        let file = file.into_inner().map_err(|e| IoError::os("write", &self.path)(e.into_error()))?;
+        file.commit().map_err(IoError::os("put in place", &self.path))?;
         Ok(self.rows)
-    }
-}
-
-impl Drop for PairsWriter {
-    /// A table that was not finished can be made again, so nothing of it stays.
-    fn drop(&mut self) {
-        std::fs::remove_file(&self.partial).ok();
     }
 }
 

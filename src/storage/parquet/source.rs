@@ -84,6 +84,18 @@ impl EpisodeSource for Parts {
         &self.manifest
     }
 
+    fn skip_to(&mut self, episode: u64) -> Result<(), StorageError> {
+        while let Some(part) = self.manifest.parts.get(self.next_part)
+            && self.current.is_none()
+            && part.episodes[1] <= episode
+        {
+            self.total.skip_to(part.episodes[1]);
+            self.next_part += 1;
+        }
+        while self.total.episodes < episode && self.next_episode()?.is_some() {}
+        Ok(())
+    }
+
     fn next_episode(&mut self) -> Result<Option<Episode>, StorageError> {
         loop {
             let Some((decoder, tally)) = &mut self.current else {
