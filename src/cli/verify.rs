@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use super::{Outcome, ui};
 use crate::Error;
-use crate::record::{Difference, Resimulation};
+use crate::record::{Difference, FLOAT_TOLERANCE, Resimulation};
 use crate::registry::Spec;
 use crate::scenario::{self, Scenario};
 use crate::schema::{Episode, Manifest};
@@ -104,7 +104,7 @@ fn scenario_of(manifest: &Manifest) -> Option<Box<dyn Scenario>> {
     scenario::build(&spec).ok()
 }
 
-/// Compares the team reward of each step with the agents' rewards, where the scenario says how they belong together.
+/// Compares the team reward of each step with the agents' rewards; another program may have rounded them otherwise.
 fn rewards(scenario: Option<&dyn Scenario>, episode: &Episode) -> Option<String> {
     let scenario = scenario?;
     let mut agents = vec![0.0; episode.rewards.len()];
@@ -114,7 +114,7 @@ fn rewards(scenario: Option<&dyn Scenario>, episode: &Episode) -> Option<String>
         }
         let expected = scenario.team_reward(&agents);
         let size = agents.iter().fold(expected.abs(), |size, r| size + r.abs());
-        if (team - expected).abs() > 1e-5 * size {
+        if (team - expected).abs() > FLOAT_TOLERANCE as f32 * size {
             return Some(format!("step {step}: the agents' rewards give the team {expected}, found {team}"));
         }
     }

@@ -12,7 +12,7 @@ use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
 
 use super::columns::{row_bytes, schema};
-use super::pages::check_pages;
+use super::pages::{PageFault, check_pages};
 use crate::io::IoError;
 use crate::schema::{Episode, Layout};
 use crate::storage::StorageError;
@@ -42,7 +42,9 @@ impl Decoder {
         let file = File::open(path).map_err(IoError::os("open", path))?;
         let pages = file.try_clone().map_err(IoError::os("open", path))?;
         let builder = guard(path, || ParquetRecordBatchReaderBuilder::try_new(file))?;
-        check_pages(&pages, builder.metadata(), PAGE_LIMIT).map_err(|m| damaged(path, m))?;
+        check_pages(&pages, builder.metadata(), PAGE_LIMIT).map_err(|fault| match fault {
+            PageFault::Unreadable(message) | PageFault::Greedy(message) => damaged(path, message),
+        })?;
         let roots = roots(builder.schema(), layout, path)?;
         let rows = (BATCH_BYTES / row_bytes(layout)).clamp(1, 8192) as usize;
         let mask = ProjectionMask::roots(builder.parquet_schema(), roots);

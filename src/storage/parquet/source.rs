@@ -7,10 +7,11 @@ use std::path::{Path, PathBuf};
 use parquet::file::metadata::ParquetMetaDataReader;
 use sha2::{Digest as _, Sha256};
 
-use super::decoder::Decoder;
+use super::decoder::{Decoder, guard};
+use super::pages::{PageFault, check_pages};
 use super::{FILE_SHA256_KEY, MANIFEST_FILE, MANIFEST_KEY, PART_KEY, find_file_digest};
 use crate::io::{self, IoError};
-use crate::schema::{Episode, Layout, Manifest, SELF_SHA256_PLACEHOLDER, hex};
+use crate::schema::{Episode, Layout, Manifest, Part, SELF_SHA256_PLACEHOLDER, hex};
 use crate::storage::{EpisodeSource, MANIFEST_LIMIT, StorageError, Tally};
 
 /// A directory of parts.
@@ -71,19 +72,7 @@ impl Parts {
             return Ok(false);
         };
         let path = self.directory.join(&part.file);
-        let size = std::fs::metadata(&path).map_err(IoError::os("read", &path))?.len();
-        let (expected, [from, to]) = (part.bytes, part.episodes);
-        if size < expected {
-            let message =
-                format!("cut short, {size} of {expected} bytes (episodes {from} to {}): copy the store again", to - 1);
-            return Err(StorageError::Damaged { message, path });
-        }
-        let (sha256, bytes) = io::sha256_file(&path)?;
-        if sha256 != part.sha256 || bytes != expected {
-            let message =
-                format!("the bytes changed since it was written (episodes {from} to {}): copy the store again", to - 1);
-            return Err(StorageError::Damaged { message, path });
-        }
+        check_part(&path, part)?;
         self.current = Some((Decoder::open(&path, &self.layout)?, Tally::default()));
         self.next_part += 1;
         Ok(true)
@@ -240,6 +229,54 @@ pub(super) fn check_file(path: &Path) -> Result<(), StorageError> {
         let message =
             format!("its bytes do not have the digest in its {FILE_SHA256_KEY}: they changed since it was written");
         return Err(StorageError::Damaged { message, path: path.to_owned() });
+    }
+    Ok(())
+}
+
+/// Largest page of anybody's table, bytes or values: writers cut them at about a mebibyte.
+const TABLE_PAGE_LIMIT: u64 = 512 << 20;
+
+/// Checks a Parquet file before somebody else's reader takes columns from it: the digest, when it is a store or a part of
+/// one, and what its pages ask for. What cannot be read at all is left to that reader.
+pub(in crate::storage) fn check_table(path: &Path) -> Result<(), StorageError> {
+    match check_file(path) {
+        Err(StorageError::NotAStore { .. } | StorageError::Truncated { .. }) => check_part_of(path)?,
+        checked => checked?,
+    }
+    let file = File::open(path).map_err(IoError::os("open", path))?;
+    let Ok(metadata) = guard(path, || ParquetMetaDataReader::new().parse_and_finish(&file)) else { return Ok(()) };
+    match check_pages(&file, &metadata, TABLE_PAGE_LIMIT) {
+        Err(PageFault::Greedy(message)) => Err(StorageError::Damaged { message, path: path.to_owned() }),
+        Ok(()) | Err(PageFault::Unreadable(_)) => Ok(()),
+    }
+}
+
+/// Checks the digest of a part in the manifest beside it, if there is one that names it.
+fn check_part_of(path: &Path) -> Result<(), StorageError> {
+    let manifest = path.with_file_name(MANIFEST_FILE);
+    let Ok(text) = io::read_text(&manifest, MANIFEST_LIMIT) else { return Ok(()) };
+    let Ok(manifest) = Manifest::parse(&text) else { return Ok(()) };
+    let name = path.file_name().unwrap_or_default();
+    match manifest.parts.iter().find(|part| *part.file == *name) {
+        Some(part) => check_part(path, part),
+        None => Ok(()),
+    }
+}
+
+/// Compares a part with its length and digest in the manifest.
+fn check_part(path: &Path, part: &Part) -> Result<(), StorageError> {
+    let size = std::fs::metadata(path).map_err(IoError::os("read", path))?.len();
+    let (expected, [from, to]) = (part.bytes, part.episodes);
+    let damaged = |what: String| {
+        let message = format!("{what} (episodes {from} to {}): copy the store again", to.saturating_sub(1));
+        StorageError::Damaged { message, path: path.to_owned() }
+    };
+    if size < expected {
+        return Err(damaged(format!("cut short, {size} of {expected} bytes")));
+    }
+    let (sha256, bytes) = io::sha256_file(path)?;
+    if sha256 != part.sha256 || bytes != expected {
+        return Err(damaged("the bytes changed since it was written".to_owned()));
     }
     Ok(())
 }
