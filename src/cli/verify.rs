@@ -69,8 +69,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
             return wrong;
         }
         match again.get_or_insert_with(|| Resimulation::of(manifest)) {
-            Ok(again) => wrong.or(again.play(episode).err().map(|e| e.to_string())),
-            Err(error) => wrong.or(Some(error.to_string())),
+            Ok(again) => again.play(episode).err().map(|e| e.to_string()).or(wrong),
+            Err(error) => Some(error.to_string()),
         }
     };
     let report = storage::verify(&args.store, &mut watch);
