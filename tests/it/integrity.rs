@@ -38,7 +38,7 @@ fn problems(report: &Report) -> Vec<(&str, &str, bool)> {
 fn killed(path: &Path, layout: &Layout, episodes: &[Episode], planned: u64) -> PathBuf {
     let manifest = Manifest { planned, ..manifest(layout) };
     let mut sink = storage::create(path, &manifest, false).unwrap();
-    episodes.iter().for_each(|e| sink.append(e).unwrap());
+    sink.append_all(episodes).unwrap();
     sink.commit().unwrap();
     drop(sink);
     partial_path(path)
@@ -210,7 +210,7 @@ fn all_committed_episodes_come_back_and_a_complete_leftover_is_no_loss() {
         let fresh = directory.path().join(format!("fresh-{form}"));
         let described = Manifest { planned: 5, ..manifest(&layout) };
         let mut sink = storage::create(&fresh, &described, false).unwrap();
-        episodes.iter().for_each(|e| sink.append(e).unwrap());
+        sink.append_all(&episodes).unwrap();
         sink.finish().unwrap();
         assert!(fs::read(data_file(&fresh)).unwrap() == fs::read(data_file(&path)).unwrap(), "as if never killed");
     }
