@@ -57,7 +57,12 @@ pub fn table(path: &Path, options: &TableOptions) -> Result<Samples, PairsError>
     if !path.exists() {
         return Err(IoError::Missing(path.to_owned()).into());
     }
-    caught(path, |form| samples(path, form, options))
+    caught(path, |form| {
+        if form == "Parquet" {
+            crate::storage::check_table(path)?;
+        }
+        samples(path, form, options)
+    })
 }
 
 fn samples(path: &Path, form: &'static str, options: &TableOptions) -> Result<Samples, PairsError> {

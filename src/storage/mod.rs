@@ -229,6 +229,15 @@ pub fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
     Ok(source)
 }
 
+/// Checks a Parquet file before its columns are read as a table: the digest, when it is a store or a part of one, and
+/// that no page asks for an absurd amount of memory.
+///
+/// # Errors
+/// [`StorageError::Damaged`].
+pub fn check_table(path: &Path) -> Result<(), StorageError> {
+    parquet::check_table(path)
+}
+
 /// Refuses a name whose ending looks like that of another kind of file. A number is no such ending (`dropout-0.2`), and
 /// a name that ends in a slash, or is a directory already, is a directory's.
 fn check_name(path: &Path) -> Result<(), StorageError> {

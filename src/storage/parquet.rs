@@ -34,6 +34,7 @@ mod journal;
 mod pages;
 mod pairs;
 mod salvage;
+mod side_by_side;
 mod sink;
 mod source;
 
@@ -85,6 +86,10 @@ fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
             "expected a directory, a .parquet or a .mcap file; for a table use `ccmarl estimate-mi FILE --x … --y …`";
         Err(StorageError::NotAStore { message: message.to_owned(), path: path.to_owned() })
     }
+}
+
+pub(super) fn check_table(path: &Path) -> Result<(), StorageError> {
+    source::check_table(path)
 }
 
 fn salvage(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {

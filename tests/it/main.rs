@@ -6,6 +6,8 @@ mod cli;
 mod estimate_mi;
 mod extracts;
 mod figures;
+mod fuzz;
+mod integrity;
 mod links;
 mod mi;
 mod record;

@@ -11,28 +11,37 @@ const HEADER_LIMIT: u64 = 1 << 20;
 /// Deepest nesting of structures in a page header.
 const DEPTH_LIMIT: u32 = 8;
 
+/// What is wrong with a page.
+pub(super) enum PageFault {
+    /// Its header cannot be found or read.
+    Unreadable(String),
+    /// It asks for more than the limit.
+    Greedy(String),
+}
+
 /// Refuses a page that asks for more than `limit` bytes or values once decompressed.
-pub(super) fn check_pages(file: &File, metadata: &ParquetMetaData, limit: u64) -> Result<(), String> {
+pub(super) fn check_pages(file: &File, metadata: &ParquetMetaData, limit: u64) -> Result<(), PageFault> {
+    use PageFault::{Greedy, Unreadable};
     let mut input = BufReader::with_capacity(1 << 12, file);
     for (group, row_group) in metadata.row_groups().iter().enumerate() {
         for column in row_group.columns() {
             let place = || format!("row group {group}, column {}", column.column_path().string());
             let first = column.dictionary_page_offset().unwrap_or_else(|| column.data_page_offset());
             let (Ok(start), Ok(length)) = (u64::try_from(first), u64::try_from(column.compressed_size())) else {
-                return Err(format!("{}: impossible place in the file", place()));
+                return Err(Unreadable(format!("{}: impossible place in the file", place())));
             };
             let mut at = 0;
             while at < length {
                 let Some(position) = start.checked_add(at) else { break };
-                input.seek(SeekFrom::Start(position)).map_err(|e| e.to_string())?;
+                input.seek(SeekFrom::Start(position)).map_err(|e| Unreadable(e.to_string()))?;
                 let mut thrift = Thrift { input: &mut input, read: 0 };
-                let page = thrift.page_header().ok_or_else(|| format!("{}: no page header at byte {at}", place()))?;
+                let page = thrift.page_header();
+                let page = page.ok_or_else(|| Unreadable(format!("{}: no page header at byte {at}", place())))?;
                 let asked = page.uncompressed.max(page.values);
                 if asked > limit {
-                    return Err(format!(
-                        "{}: a page asks for {asked} bytes or values, over the limit {limit}",
-                        place()
-                    ));
+                    let message =
+                        format!("{}: a page asks for {asked} bytes or values, over the limit {limit}", place());
+                    return Err(Greedy(message));
                 }
                 at = at.saturating_add(thrift.read).saturating_add(page.compressed);
             }

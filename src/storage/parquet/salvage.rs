@@ -1,14 +1,10 @@
 //! What a kill leaves of a directory or file: sealed parts, and the journal of the one that was being written.
 
 use std::fs::File;
-use std::io::{BufReader, Read};
+use std::io::{BufReader, Cursor, Read};
 use std::path::{Path, PathBuf};
 
-use arrow::array::RecordBatch;
-use arrow::buffer::Buffer;
-use arrow::datatypes::{Schema, SchemaRef};
-use arrow::error::ArrowError;
-use arrow::ipc::reader::StreamDecoder;
+use arrow::ipc::reader::StreamReader;
 use arrow::ipc::root_as_message;
 use parquet::file::metadata::ParquetMetaDataReader;
 
@@ -51,8 +47,8 @@ impl Leftover {
         let (decoder, path) = if part.is_file() {
             (Decoder::open(&part, &self.layout)?, part)
         } else if journal.is_file() {
-            let (schema, batches) = read_journal(&journal)?;
-            (Decoder::journal(&journal, &self.layout, &schema, Box::new(batches))?, journal)
+            let batches = read_journal(&journal)?;
+            (Decoder::journal(&journal, &self.layout, &batches.schema(), Box::new(batches))?, journal)
         } else {
             return Ok(false);
         };
@@ -102,34 +98,24 @@ fn manifest_text(directory: &Path) -> Result<Option<String>, StorageError> {
     if !journal.is_file() {
         return Ok(None);
     }
-    let (schema, _) = read_journal(&journal)?;
-    Ok(schema.metadata().get(MANIFEST_KEY).cloned())
+    Ok(read_journal(&journal)?.schema().metadata().get(MANIFEST_KEY).cloned())
 }
 
-/// The schema of a journal and its whole batches. A torn last batch ends them: it was never committed.
-fn read_journal(
-    path: &Path,
-) -> Result<(Schema, impl Iterator<Item = Result<RecordBatch, ArrowError>> + Send + use<>), StorageError> {
+/// The whole batches of a journal. A torn last batch ends them: it was never committed.
+fn read_journal(path: &Path) -> Result<StreamReader<Messages<BufReader<File>>>, StorageError> {
     let file = File::open(path).map_err(IoError::os("open", path))?;
     let left = file.metadata().map_err(IoError::os("read", path))?.len();
-    let mut messages = Messages { input: BufReader::with_capacity(1 << 18, file), left };
-    let mut decoder = StreamDecoder::new();
-    let empty = || {
-        let message = "the journal ends before its first batch: nothing was committed; record again".to_owned();
-        StorageError::NotAStore { message, path: path.to_owned() }
-    };
-    let mut first = messages.next().ok_or_else(empty)?;
-    guard(path, || decoder.decode(&mut first))?;
-    let schema: SchemaRef = decoder.schema().ok_or_else(empty)?;
-    let batches = messages.filter_map(move |mut message| decoder.decode(&mut message).transpose());
-    Ok((Schema::clone(&schema), batches))
+    let messages = Messages { input: BufReader::with_capacity(1 << 18, file), left, whole: Cursor::default() };
+    guard(path, || StreamReader::try_new(messages, None))
 }
 
-/// The messages of an Arrow IPC stream, each whole. Their sizes are compared with what the file still has before memory
-/// is given to them, so that a journal cannot ask for more than it holds.
+/// The messages of an Arrow IPC stream, each whole; what is torn is not read. Their sizes are compared with what the
+/// file still has before memory is given to them, so that a journal cannot ask for more than it holds.
 struct Messages<R> {
     input: R,
     left: u64,
+    /// The message at hand.
+    whole: Cursor<Vec<u8>>,
 }
 
 impl<R: Read> Messages<R> {
@@ -138,12 +124,9 @@ impl<R: Read> Messages<R> {
         let mut bytes = Vec::new();
         (self.input.by_ref().take(count).read_to_end(&mut bytes).ok()? as u64 == count).then_some(bytes)
     }
-}
 
-impl<R: Read> Iterator for Messages<R> {
-    type Item = Buffer;
-
-    fn next(&mut self) -> Option<Buffer> {
+    /// The next message, or `None` at the end of what is whole.
+    fn message(&mut self) -> Option<Vec<u8>> {
         let mut message = self.take(8)?;
         let (marker, length) = message.split_at(4);
         let length = u32::from_le_bytes(length.try_into().ok()?);
@@ -154,6 +137,15 @@ impl<R: Read> Iterator for Messages<R> {
         let body = u64::try_from(root_as_message(&head).ok()?.bodyLength()).ok()?;
         message.extend(head);
         message.extend(self.take(body)?);
-        Some(Buffer::from_vec(message))
+        Some(message)
+    }
+}
+
+impl<R: Read> Read for Messages<R> {
+    fn read(&mut self, out: &mut [u8]) -> std::io::Result<usize> {
+        if self.whole.position() == self.whole.get_ref().len() as u64 {
+            self.whole = Cursor::new(self.message().unwrap_or_default());
+        }
+        self.whole.read(out)
     }
 }
