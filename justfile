@@ -45,3 +45,7 @@ tables:
 # The stores in other people's readers: pyarrow, polars, duckdb, pandas, datasets, mcap, foxglove, rerun, pymcap-cli (needs python3 with venv, and PyPI)
 interop:
     tests/interop/run.sh
+
+# Kills recordings at random moments and recovers them (needs a release build and python3)
+kill *args:
+    tests/interop/kill.sh {{args}}

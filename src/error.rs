@@ -54,10 +54,13 @@ impl Error {
             Self::Registry(e) | Self::Train(TrainError::Registry(e)) => !matches!(e, RegistryError::Data(_)),
             Self::Usage(_)
             | Self::Record(RecordError::NoEpisodes)
-            | Self::Storage(StorageError::Extension { .. })
-            | Self::Train(TrainError::Storage(StorageError::Extension { .. }))
             | Self::Report(ReportError::NoInput)
-            | Self::Train(TrainError::Config { .. } | TrainError::Value { .. }) => true,
+            | Self::Storage(StorageError::Extension { .. })
+            | Self::Train(
+                TrainError::Config { .. }
+                | TrainError::Value { .. }
+                | TrainError::Storage(StorageError::Extension { .. }),
+            ) => true,
             Self::Io(e)
             | Self::Report(ReportError::Io(e))
             | Self::Storage(StorageError::Io(e))

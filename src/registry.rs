@@ -125,6 +125,29 @@ impl Spec {
         })
     }
 
+    /// The parameters laid over `defaults`, whose fields are all that there are.
+    ///
+    /// # Errors
+    /// [`RegistryError::Params`] that names the field, with the nearest names for one that does not exist.
+    pub fn params_over<P: Serialize + DeserializeOwned>(&self, defaults: &P) -> Result<P, RegistryError> {
+        let known = resolved(&self.name, defaults);
+        let read = |given: &mut dyn Iterator<Item = (&String, &Value)>| {
+            let mut fields = known.clone();
+            fields.shift_remove("name");
+            fields.extend(given.map(|(key, value)| (key.clone(), value.clone())));
+            serde_json::from_value::<P>(Value::Object(fields)).map_err(|error| error.to_string())
+        };
+        if let Some(key) = self.params.keys().find(|key| !known.contains_key(*key)) {
+            let names = known.keys().map(String::as_str).filter(|name| *name != "name");
+            return Err(self.invalid(format!("unknown field `{key}`: {}", did_you_mean(key, names))));
+        }
+        read(&mut self.params.iter()).map_err(|message| {
+            // The parser does not say which field: it is one that fails alone.
+            let culprit = self.params.iter().find(|field| read(&mut std::iter::once(*field)).is_err());
+            self.invalid(culprit.map_or(message.clone(), |(key, _)| format!("{key}: {message}")))
+        })
+    }
+
     /// Checks that no parameter was given, for plugins that take none.
     ///
     /// # Errors
@@ -261,6 +284,20 @@ mod tests {
         assert_eq!(error(spec.clone()), "x: missing field `p`");
         assert_eq!(error(spec.clone().with("p", 1).with("q", 1)), "x: unknown field `q`, expected `p` or `n`");
         assert!(error(spec.with("p", 1).with("n", -1)).starts_with("x: n: invalid value: integer `-1`"));
+    }
+
+    #[test]
+    fn parameters_are_laid_over_defaults_and_name_what_is_wrong() {
+        #[derive(Debug, PartialEq, Serialize, Deserialize)]
+        struct Params {
+            p: f64,
+            count: usize,
+        }
+        let over = |spec: Spec| spec.params_over(&Params { p: 0.5, count: 3 }).map_err(|e| e.to_string());
+        assert_eq!(over(Spec::new("x").with("count", 4)), Ok(Params { p: 0.5, count: 4 }));
+        assert_eq!(over(Spec::new("x").with("cuont", 4)).unwrap_err(), "x: unknown field `cuont`: did you mean count?");
+        let wrong = over(Spec::new("x").with("p", 1).with("count", -1)).unwrap_err();
+        assert!(wrong.starts_with("x: count: invalid value: integer `-1`"), "{wrong}");
     }
 
     #[test]

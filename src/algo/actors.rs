@@ -79,6 +79,8 @@ pub struct Actors {
     pub names: Vec<String>,
     /// Width of each learner's observation (and so of its message).
     pub observation: Vec<usize>,
+    /// What bounds the actions: tanh or sigmoid.
+    pub output: Activation,
     /// Whether messages enter the networks at all.
     pub messages: bool,
     /// One network per learner.
@@ -90,8 +92,8 @@ pub struct Actors {
 }
 
 impl Actors {
-    /// Actors with two hidden `ReLU` layers and tanh outputs for these learners.
-    pub fn new(learners: &[&AgentSpec], hidden: &[usize], messages: bool) -> Self {
+    /// Actors with hidden `ReLU` layers for these learners. `output` is tanh for actions in [-1, 1], sigmoid for [0, 1].
+    pub fn new(learners: &[&AgentSpec], hidden: &[usize], output: Activation, messages: bool) -> Self {
         let observation: Vec<usize> = learners.iter().map(|a| a.observation).collect();
         let all: usize = observation.iter().sum();
         let networks: Vec<Mlp> = learners
@@ -100,19 +102,25 @@ impl Actors {
                 let input = if messages { all } else { agent.observation };
                 let widths: Vec<usize> =
                     std::iter::once(input).chain(hidden.iter().copied()).chain([agent.action]).collect();
-                Mlp::new(&widths, Activation::Relu, Activation::Tanh)
+                Mlp::new(&widths, Activation::Relu, output)
             })
             .collect();
         let names = learners.iter().map(|a| a.name.clone()).collect();
-        Self::assemble(names, observation, messages, networks)
+        Self::assemble(names, observation, output, messages, networks)
     }
 
-    fn assemble(names: Vec<String>, observation: Vec<usize>, messages: bool, networks: Vec<Mlp>) -> Self {
+    fn assemble(
+        names: Vec<String>,
+        observation: Vec<usize>,
+        output: Activation,
+        messages: bool,
+        networks: Vec<Mlp>,
+    ) -> Self {
         let mut offsets = vec![0];
         for network in &networks {
             offsets.push(offsets[offsets.len() - 1] + network.parameters());
         }
-        Self { names, observation, messages, networks, offsets, steps: 0 }
+        Self { names, observation, output, messages, networks, offsets, steps: 0 }
     }
 
     /// Learners.
@@ -191,7 +199,7 @@ impl Actors {
             observation: self.observation.clone(),
             messages: self.messages,
             hidden_activation: "relu".to_owned(),
-            output_activation: "tanh".to_owned(),
+            output_activation: if self.low() < 0.0 { "tanh" } else { "sigmoid" }.to_owned(),
             steps,
             sha256: digest(params),
         };
@@ -221,8 +229,13 @@ impl Actors {
         let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).map_err(|e| e.to_string())?;
         let metadata = header.metadata().clone().unwrap_or_default();
         let json = metadata.get(HEADER).ok_or_else(|| format!("the metadata key {HEADER:?} is missing"))?;
-        let Header { version, learners: names, observation, messages, steps, sha256, .. } =
+        let Header { version, learners: names, observation, messages, output_activation, steps, sha256, .. } =
             serde_json::from_str(json).map_err(|e| format!("the metadata key {HEADER:?}: {e}"))?;
+        let output = match output_activation.as_str() {
+            "tanh" => Activation::Tanh,
+            "sigmoid" => Activation::Sigmoid,
+            other => return Err(format!("output activation must be tanh or sigmoid, found {other:?}")),
+        };
         if version != FILE_VERSION {
             return Err(format!("actor file version {version} is not {FILE_VERSION}"));
         }
@@ -245,7 +258,7 @@ impl Actors {
             if widths.len() < 2 {
                 return Err(format!("the network of {name:?} is missing"));
             }
-            networks.push(Mlp::new(&widths, Activation::Relu, Activation::Tanh));
+            networks.push(Mlp::new(&widths, Activation::Relu, output));
         }
         let builder =
             VarBuilder::from_buffered_safetensors(bytes, DType::F32, &Device::Cpu).map_err(|e| e.to_string())?;
@@ -256,15 +269,24 @@ impl Actors {
         if digest(&params) != sha256 {
             return Err("its parameters do not match their digest: the file was changed or damaged".to_owned());
         }
-        Ok((Self { steps, ..Self::assemble(names, observation, messages, networks) }, params))
+        Ok((Self { steps, ..Self::assemble(names, observation, output, messages, networks) }, params))
     }
 
-    /// Checks that these actors fit the learners of a scenario.
+    /// Least value of an action component; the largest is 1.
+    pub fn low(&self) -> f32 {
+        if self.output == Activation::Sigmoid { 0.0 } else { -1.0 }
+    }
+
+    /// Checks that these actors fit the learners of a scenario whose actions are in [`low`, 1].
     ///
     /// # Errors
     /// [`RunPolicyError::DoesNotFit`] that names the first difference.
-    pub fn check_fit(&self, learners: &[&AgentSpec], path: &Path) -> Result<(), RunPolicyError> {
+    pub fn check_fit(&self, learners: &[&AgentSpec], low: f32, path: &Path) -> Result<(), RunPolicyError> {
         let fail = |message: String| Err(RunPolicyError::DoesNotFit { message, path: path.to_owned() });
+        if self.low() != low {
+            let found = self.low();
+            return fail(format!("trained for actions in [{found}, 1], the scenario's decoder takes [{low}, 1]"));
+        }
         if learners.len() != self.len() {
             return fail(format!("trained for {} learners, the scenario has {}", self.len(), learners.len()));
         }
@@ -305,7 +327,7 @@ mod tests {
     #[test]
     fn a_lost_message_enters_as_zeros_and_the_own_observation_comes_first() {
         let agents = [agent("a", 2), agent("b", 1), agent("c", 2)];
-        let actors = Actors::new(&agents.iter().collect::<Vec<_>>(), &[4], true);
+        let actors = Actors::new(&agents.iter().collect::<Vec<_>>(), &[4], Activation::Tanh, true);
         let mut link = [true; 9];
         link[3] = false; // b -> a is lost
         let mut input = Vec::new();
@@ -318,13 +340,13 @@ mod tests {
     fn actors_survive_their_file_and_damage_is_an_error() {
         let agents = [agent("a", 3), agent("b", 4)];
         let agents: Vec<&AgentSpec> = agents.iter().collect();
-        let actors = Actors::new(&agents, &[8, 8], true);
+        let actors = Actors::new(&agents, &[8, 8], Activation::Sigmoid, true);
         let params = actors.init(&mut Seeds::new(1).stream("actors"));
         let bytes = actors.to_bytes(&params, 25).unwrap();
         assert!(bytes == actors.to_bytes(&params, 25).unwrap());
         let (read, again) = Actors::from_bytes(bytes.clone()).unwrap();
         assert_eq!((&again, &read.networks), (&params, &actors.networks));
-        assert_eq!(read.steps, 25);
+        assert_eq!((read.steps, read.low()), (25, 0.0));
         for bit in (bytes.len() * 8 - params.len() * 32..bytes.len() * 8).step_by(37) {
             let mut flipped = bytes.clone();
             flipped[bit / 8] ^= 1 << (bit % 8);
@@ -334,7 +356,8 @@ mod tests {
             assert!(Actors::from_bytes(bytes[..cut].to_vec()).is_err());
         }
         let other = [agent("a", 3), agent("b", 5)];
-        let error = actors.check_fit(&other.iter().collect::<Vec<_>>(), Path::new("runs/x")).unwrap_err().to_string();
+        let error =
+            actors.check_fit(&other.iter().collect::<Vec<_>>(), 0.0, Path::new("runs/x")).unwrap_err().to_string();
         assert!(error.contains("b has observation and action widths [5, 2]"), "{error}");
     }
 }

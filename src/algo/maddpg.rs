@@ -165,12 +165,17 @@ struct Scratch {
 }
 
 impl Maddpg {
-    /// A learner with fresh networks for these agents.
+    /// A learner with fresh networks for these agents; `output` bounds their actions.
     ///
     /// # Errors
     /// [`NnError`] when candle refuses the allocation.
-    pub fn new(learners: &[&AgentSpec], config: MaddpgConfig, seeds: &Seeds) -> Result<Self, NnError> {
-        let actors = Actors::new(learners, &config.hidden, config.messages == Messages::Observation);
+    pub fn new(
+        learners: &[&AgentSpec],
+        output: Activation,
+        config: MaddpgConfig,
+        seeds: &Seeds,
+    ) -> Result<Self, NnError> {
+        let actors = Actors::new(learners, &config.hidden, output, config.messages == Messages::Observation);
         let joint: usize = learners.iter().map(|a| a.observation + a.action).sum();
         let widths: Vec<usize> = [joint].into_iter().chain(config.hidden.iter().copied()).chain([1]).collect();
         let critic = Mlp::new(&widths, Activation::Relu, Activation::Identity);
@@ -417,7 +422,8 @@ mod tests {
     fn the_actors_move_up_the_critic_and_the_critic_towards_its_target() {
         let agents = agents(2);
         let config = MaddpgConfig { actor_learning_rate: 1e-3, tau: 0.0, ..MaddpgConfig::default() };
-        let mut learner = Maddpg::new(&agents.iter().collect::<Vec<_>>(), config, &Seeds::new(1)).unwrap();
+        let mut learner =
+            Maddpg::new(&agents.iter().collect::<Vec<_>>(), Activation::Tanh, config, &Seeds::new(1)).unwrap();
         let batch = batch(256);
         let before = learner.td_loss(&batch);
         let first = learner.update(&batch, &[]).unwrap();
@@ -435,8 +441,8 @@ mod tests {
         let agents = agents(2);
         let agents: Vec<&AgentSpec> = agents.iter().collect();
         let batch = batch(64);
-        let mut plain = Maddpg::new(&agents, MaddpgConfig::default(), &Seeds::new(1)).unwrap();
-        let mut shaped = Maddpg::new(&agents, MaddpgConfig::default(), &Seeds::new(1)).unwrap();
+        let mut plain = Maddpg::new(&agents, Activation::Tanh, MaddpgConfig::default(), &Seeds::new(1)).unwrap();
+        let mut shaped = Maddpg::new(&agents, Activation::Tanh, MaddpgConfig::default(), &Seeds::new(1)).unwrap();
         let richer = Batch { reward: batch.reward.iter().map(|r| r + 3.0).collect(), ..batch.clone() };
         let a = plain.update(&richer, &[]).unwrap();
         let b = shaped.update(&batch, &vec![3.0; 64]).unwrap();
@@ -448,7 +454,7 @@ mod tests {
         let agents = agents(2);
         let agents: Vec<&AgentSpec> = agents.iter().collect();
         let config = MaddpgConfig { grad_clip: f32::INFINITY, action_penalty: 0.0, ..MaddpgConfig::default() };
-        let mut learner = Maddpg::new(&agents, config, &Seeds::new(4)).unwrap();
+        let mut learner = Maddpg::new(&agents, Activation::Sigmoid, config, &Seeds::new(4)).unwrap();
         let batch = batch(32);
         let widths = Widths::of(&learner.actors);
         let objective = |learner: &Maddpg| {

@@ -87,9 +87,8 @@ fn rewards(scenario: Option<&dyn Scenario>, episode: &Episode) -> Option<String>
         for (agent, column) in agents.iter_mut().zip(&episode.rewards) {
             *agent = column[step];
         }
-        let expected = scenario.team_reward(&agents)?;
-        let size = agents.iter().fold(expected.abs(), |size, r| size + r.abs());
-        if (team - expected).abs() > 1e-5 * size {
+        let expected = scenario.team_reward(&agents);
+        if team != expected {
             return Some(format!("step {step}: the agents' rewards give the team {expected}, found {team}"));
         }
     }

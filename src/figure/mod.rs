@@ -6,6 +6,7 @@
 mod channel_returns;
 mod learning_curves;
 mod mi_heatmap;
+mod scaling;
 mod style;
 
 use std::path::{Path, PathBuf};
@@ -13,7 +14,8 @@ use std::path::{Path, PathBuf};
 use crate::registry::Entry;
 
 /// All figures.
-pub const FIGURES: &[Entry<Render>] = &[learning_curves::ENTRY, channel_returns::ENTRY, mi_heatmap::ENTRY];
+pub const FIGURES: &[Entry<Render>] =
+    &[learning_curves::ENTRY, channel_returns::ENTRY, mi_heatmap::ENTRY, scaling::ENTRY];
 
 /// Draws a figure from `data` onto a target.
 pub type Render = fn(&Data, Target<'_>) -> Result<(), FigureError>;
@@ -40,6 +42,8 @@ pub struct Data {
     pub series: Vec<String>,
     /// Curves over training.
     pub curves: Vec<Curve>,
+    /// Costs by size, each the `step` of its point.
+    pub costs: Vec<Curve>,
     /// Bars by group and series.
     pub bars: Vec<Bar>,
     /// Horizontal lines of constant value (random policy, oracle).
@@ -183,6 +187,13 @@ mod tests {
             unit: "return per episode".to_owned(),
             series: vec!["<b>&\u{1}".to_owned()],
             curves: vec![Curve { series: "<b>&\u{1}".to_owned(), points: vec![point(0.0), point(1e4), point(2e4)] }],
+            costs: vec![Curve {
+                series: "<b>&\u{1}".to_owned(),
+                points: vec![
+                    Point { step: 3.0, value: 0.1, band: None },
+                    Point { step: 100.0, value: 9.0, band: None },
+                ],
+            }],
             bars: vec![bar("unrestricted", -80.0), bar("none", -120.0)],
             references: vec![Reference { label: "random".to_owned(), value: -200.0 }],
             cells: vec![cell("delivered", 0.4133), cell("lost", f64::NAN)],
@@ -216,6 +227,7 @@ mod tests {
                 "figure learning-curves: expected at least one curve with points, found none",
                 "figure channel-returns: expected at least one bar, found none",
                 "figure mi-heatmap: expected at least one cell with a value, found none",
+                "figure scaling: expected at least one cost with points, found none",
             ]
         );
     }

@@ -187,7 +187,18 @@ pub(super) fn mesh<DB: DrawingBackend>(
 ) -> Drawn<DB> {
     let range = chart.y_range();
     let digits = decimals(range.end - range.start);
-    let y_label = |y: &f64| number(*y, digits);
+    mesh_with(chart, (y_name, &|y: &f64| number(*y, digits)), (x_name, x_label))
+}
+
+/// How the ticks of an axis are written.
+type Ticks<'a> = &'a dyn Fn(&f64) -> String;
+
+/// Grid, ticks as the closures write them, and axis names.
+pub(super) fn mesh_with<DB: DrawingBackend>(
+    chart: &mut Chart<'_, DB>,
+    (y_name, y_label): (&str, Ticks<'_>),
+    (x_name, x_label): (Option<&str>, Ticks<'_>),
+) -> Drawn<DB> {
     chart
         .configure_mesh()
         .disable_x_mesh()

@@ -25,6 +25,8 @@ pub enum Activation {
     LeakyRelu,
     /// tanh z.
     Tanh,
+    /// 1 / (1 + e⁻ᶻ).
+    Sigmoid,
 }
 
 impl Activation {
@@ -34,6 +36,7 @@ impl Activation {
             Self::Relu => z.max(0.0),
             Self::LeakyRelu => z.max(0.01 * z),
             Self::Tanh => z.tanh(),
+            Self::Sigmoid => 1.0 / (1.0 + (-z).exp()),
         }
     }
 
@@ -50,6 +53,7 @@ impl Activation {
                 }
             }
             Self::Tanh => 1.0 - y * y,
+            Self::Sigmoid => y * (1.0 - y),
         }
     }
 }
@@ -313,6 +317,7 @@ mod tests {
                 Activation::Relu => h.relu().unwrap(),
                 Activation::LeakyRelu => candle_nn::ops::leaky_relu(&h, 0.01).unwrap(),
                 Activation::Tanh => h.tanh().unwrap(),
+                Activation::Sigmoid => candle_nn::ops::sigmoid(&h).unwrap(),
             };
         }
         let w = Tensor::from_slice(w, (rows, mlp.outputs()), dev).unwrap();
@@ -324,12 +329,13 @@ mod tests {
 
     #[test]
     fn passes_equal_candles_autograd() {
-        use Activation::{Identity, LeakyRelu, Relu, Tanh};
+        use Activation::{Identity, LeakyRelu, Relu, Sigmoid, Tanh};
         let cases = [
             (vec![18, 64, 64, 2], Relu, Tanh, 1024),
             (vec![7, 64, 64, 1], Relu, Identity, 300),
             (vec![5, 32], LeakyRelu, LeakyRelu, 257),
             (vec![16, 32, 20], Relu, Tanh, 3),
+            (vec![9, 16, 5], Relu, Sigmoid, 70),
             (vec![1, 17, 3], Tanh, Identity, 1),
         ];
         for (case, (widths, hidden, output, rows)) in cases.into_iter().enumerate() {

@@ -2,18 +2,20 @@
 
 mod probe;
 mod random;
+mod resimulate;
 mod rollout;
 mod run;
 mod scripted;
 
 use serde_json::{Map, Value};
 
+pub use resimulate::{Difference, FLOAT_TOLERANCE, STATE_TOLERANCE, resimulate};
 pub use rollout::{EpisodeReturn, Options, Recorded, Recording, loss_rate, returns};
 pub use run::{ActionNoise, Trained};
 
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
-use crate::scenario::{Scenario, World};
+use crate::scenario::Scenario;
 use crate::schema::{AgentSpec, Controller};
 use crate::storage::StorageError;
 
@@ -29,6 +31,12 @@ pub enum RecordError {
     /// The store.
     #[error(transparent)]
     Storage(#[from] StorageError),
+    /// A scenario that the manifest names cannot be built.
+    #[error(transparent)]
+    Scenario(#[from] RegistryError),
+    /// The store's columns, states or actions are not those of its scenario.
+    #[error("the store does not fit the scenario that its manifest names: {0}")]
+    Mismatch(String),
     /// The operating system gave no threads.
     #[error("could not start {threads} threads: {reason}: give fewer with --threads")]
     Threads {
@@ -67,8 +75,8 @@ pub trait Policy: Send + Sync {
 /// What a policy sees at one step. Flat buffers concatenate the agents in order.
 #[derive(Clone, Copy, Debug)]
 pub struct View<'a> {
-    /// The world before the action.
-    pub world: &'a World,
+    /// The world's state before the action.
+    pub state: &'a [f64],
     /// `[Σ observation]`.
     pub observations: &'a [f32],
     /// `[Σ message]`, as sent, before the channel.
@@ -94,6 +102,14 @@ pub fn send_observations(agents: &[AgentSpec], observations: &[f32], messages: &
         o += agent.observation;
         m += agent.message;
     }
+}
+
+/// Refuses a scenario of discrete actions, for policies whose actions are vectors.
+fn refuse_discrete(spec: &Spec, scenario: &dyn Scenario) -> Result<(), RegistryError> {
+    if scenario.space().discrete {
+        return Err(spec.invalid("its actions are continuous, the scenario's are discrete: set discrete=false"));
+    }
+    Ok(())
 }
 
 /// Where the actions of each agent under policy control lie in the flat buffer.

@@ -48,8 +48,9 @@ struct Probe {
     rho: f64,
 }
 
-fn build(spec: &Spec, _scenario: &dyn Scenario) -> Result<Box<dyn Policy>, RegistryError> {
+fn build(spec: &Spec, scenario: &dyn Scenario) -> Result<Box<dyn Policy>, RegistryError> {
     let probe: Probe = spec.params()?;
+    super::refuse_discrete(spec, scenario)?;
     spec.in_range("rho", probe.rho, -1.0, 1.0)?;
     Ok(Box::new(probe))
 }

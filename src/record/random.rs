@@ -2,7 +2,8 @@
 //! Actions that look at nothing: the lowest reference row of every table.
 //!
 //! # Definition
-//! Every action component is uniform in [-1, 1), independent. Messages are the senders' observations.
+//! Every action component is uniform over its range ([-1, 1), or [0, 1) for decoder `mpe2`), independent; a discrete action
+//! is one of all, equally likely. Messages are the senders' observations.
 //!
 //! # Shapes and units
 //! Actions as the scenario's decoder takes them.
@@ -23,7 +24,7 @@ use serde_json::{Map, Value};
 
 use super::{Build, Policy, PolicyEpisode, View};
 use crate::registry::Entry;
-use crate::rng::{Seeds, Stream, uniform};
+use crate::rng::{Seeds, Stream};
 use crate::scenario::Scenario;
 
 /// The policy's line in the registry.
@@ -64,8 +65,9 @@ impl PolicyEpisode for Episode<'_> {
     }
 
     fn act(&mut self, _view: &View<'_>, actions: &mut [f32]) {
+        let space = self.scenario.space();
         for (span, stream) in &mut self.actors {
-            actions[span.clone()].fill_with(|| uniform(stream, -1.0, 1.0) as f32);
+            space.sample(stream, &mut actions[span.clone()]);
         }
     }
 }

@@ -7,7 +7,7 @@ use rayon::iter::{IntoParallelIterator as _, ParallelIterator as _};
 use super::{Policy, RecordError, View};
 use crate::link::Link;
 use crate::rng::Seeds;
-use crate::scenario::Scenario;
+use crate::scenario::{Scenario, Scratch};
 use crate::schema::{Episode, Layout, Manifest};
 use crate::storage::EpisodeSink;
 
@@ -91,32 +91,32 @@ impl Recording<'_> {
         let mut link = vec![true; communicators.len() * communicators.len()];
         let mut positions = vec![[0.0; 2]; communicators.len()];
 
-        let mut world = scenario.world();
-        scenario.reset(&mut world, &mut seeds.stream("world"));
+        let (mut state, mut scratch) = (vec![0.0; scenario.shape().width()], Scratch::default());
+        scenario.reset(&mut state, &mut seeds.stream("world"));
         let mut rule = seeds.stream("scripted");
         let mut links = self.link.start(communicators.len(), &seeds.child("link"));
         let mut policy = self.policy.start(scenario, &seeds.child("policy"));
         let mut episode = Episode::with_capacity(layout, index, steps);
         for t in 0..=steps {
-            scenario.observe(&world, &mut observations);
+            scenario.observe(&state, &mut observations);
             policy.send(&observations, &mut messages);
             for (position, &agent) in positions.iter_mut().zip(&communicators) {
-                *position = world.positions[agent];
+                *position = scenario.shape().world(&state).position(agent);
             }
             links.emit(&positions, &mut link);
-            scenario.state(&world, &mut episode.state);
+            episode.state.extend_from_slice(&state);
             append(&mut episode.observations, &observations);
             append(&mut episode.messages, &messages);
             episode.link.extend_from_slice(&link);
             if t == steps {
                 break; // the last row has no action
             }
-            let view = View { world: &world, observations: &observations, messages: &messages, link: &link };
+            let view = View { state: &state, observations: &observations, messages: &messages, link: &link };
             policy.act(&view, &mut actions);
-            scenario.scripted(&world, &mut rule, &mut actions);
-            let reward = scenario.step(&mut world, &actions, &mut rewards);
+            scenario.scripted(&state, &mut rule, &mut actions);
+            scenario.step(&mut state, &actions, &mut rewards, &mut scratch);
             append(&mut episode.actions, &actions);
-            episode.reward.push(reward);
+            episode.reward.push(scenario.team_reward(&rewards));
             episode.rewards.iter_mut().zip(&rewards).for_each(|(column, &r)| column.push(r));
         }
         episode.steps = steps;

@@ -2,11 +2,11 @@
 //! A trained team: the actors of a run directory, with or without exploration noise.
 //!
 //! # Definition
-//! a^i = clamp(π^i(o^i, {ι^{ji} o^j}) + noise, −1, 1); noise is none, Gaussian with standard deviation σ, or the
+//! a^i = clamp(π^i(o^i, {ι^{ji} o^j}) + noise, low, 1), low −1, or 0 for decoder `mpe2`; noise is none, Gaussian with standard deviation σ, or the
 //! Ornstein–Uhlenbeck process x ← x − θ x + σ z of the training loop, times its scale.
 //!
 //! # Shapes and units
-//! One action row per learner, in \[−1, 1\]; the message is the sender's observation.
+//! One action row per learner, in \[low, 1\]; the message is the sender's observation.
 //!
 //! # Parameters
 //! `path` (the run directory), `action_noise` (σ, default 0).
@@ -49,11 +49,13 @@ pub(super) const ENTRY: Entry<Build> = Entry {
             action_noise: f64,
         }
         let params: Params = spec.params()?;
+        super::refuse_discrete(spec, scenario)?;
         if !(0.0..=10.0).contains(&params.action_noise) {
             return Err(spec.invalid(format!("action_noise: expected 0 to 10, found {}", params.action_noise)));
         }
         let (actors, values) = Actors::load(&params.path).map_err(|e| RegistryError::Data(e.to_string()))?;
-        actors.check_fit(&learners(scenario), &params.path).map_err(|e| RegistryError::Data(e.to_string()))?;
+        let low = scenario.space().decoder.low();
+        actors.check_fit(&learners(scenario), low, &params.path).map_err(|e| RegistryError::Data(e.to_string()))?;
         let noise =
             if params.action_noise > 0.0 { ActionNoise::Gaussian(params.action_noise) } else { ActionNoise::None };
         let parameters =
@@ -173,7 +175,7 @@ impl PolicyEpisode for Acting<'_> {
                         scale * *x
                     }
                 };
-                *action = (*action + noise as f32).clamp(-1.0, 1.0);
+                *action = (*action + noise as f32).clamp(self.team.actors.low(), 1.0);
             }
         }
     }

@@ -60,6 +60,6 @@ impl PolicyEpisode for Episode<'_> {
     }
 
     fn act(&mut self, view: &View<'_>, actions: &mut [f32]) {
-        self.scenario.oracle(view.world, actions);
+        self.scenario.oracle(view.state, actions);
     }
 }

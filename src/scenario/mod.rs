@@ -1,27 +1,32 @@
 //! Scenarios: particle worlds with agents, rewards and observations.
 //!
-//! A scenario is immutable after it is built; all that changes during an episode is in [`World`]. Adding one: write
-//! `scenario/<name>.rs` with an `ENTRY`, and add `mod <name>;` and `<name>::ENTRY,` below.
+//! A scenario is immutable after it is built; all that changes during an episode is a row of `f64`, the `state` column
+//! of the store. Adding one: write `scenario/<name>.rs` with an `ENTRY`, and add `mod <name>;` and `<name>::ENTRY,`
+//! below.
 
-mod decoder;
+mod action;
+mod params;
+mod simple_adversary;
+mod simple_reference;
 mod simple_spread;
 mod simple_tag;
 mod world;
+mod worlds;
 
 use serde_json::{Map, Value};
 
-pub use decoder::Decoder;
-pub use world::{Body, Integration, Laws, Physics, World};
+pub use action::{ActionError, ActionSpace, Decoder};
+pub use params::MAX_AGENTS;
+pub use world::{Body, Integration, Laws, Physics, Scratch, Shape, World};
+pub use worlds::Worlds;
 
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Stream;
-use crate::schema::{AgentSpec, Layout};
+use crate::schema::{AgentSpec, Controller, Layout};
 
 /// All scenarios.
-pub const SCENARIOS: &[Entry<Build>] = &[simple_spread::ENTRY, simple_tag::ENTRY];
-
-/// Most agents of a scenario: observations grow as the square of it.
-pub const MAX_AGENTS: usize = 1000;
+pub const SCENARIOS: &[Entry<Build>] =
+    &[simple_adversary::ENTRY, simple_reference::ENTRY, simple_spread::ENTRY, simple_tag::ENTRY];
 
 /// Builds a scenario from its checked parameters.
 pub type Build = fn(&Spec) -> Result<Box<dyn Scenario>, RegistryError>;
@@ -34,22 +39,65 @@ pub fn build(spec: &Spec) -> Result<Box<dyn Scenario>, RegistryError> {
     (crate::registry::find("scenario", SCENARIOS, &spec.name)?.build)(spec)
 }
 
+/// What every scenario has: who is there, what they can do, how bodies move, and for how long.
+#[derive(Clone, Debug)]
+pub struct Base {
+    /// Agents in order; `message` holds the default width (the sender's observation for communicators, else 0).
+    pub agents: Vec<AgentSpec>,
+    /// What each of them can do.
+    pub space: ActionSpace,
+    /// How bodies move.
+    pub physics: Physics,
+    /// Steps in an episode (time limit).
+    pub steps: usize,
+    /// What of the agents' rewards a trainer optimises.
+    pub team: Team,
+}
+
+/// What a team earns, from what its agents earn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Team {
+    /// The first agent's reward (which all share, or which all are to maximise).
+    First,
+    /// The sum over all agents.
+    Sum,
+}
+
 /// A task: who is there, how the world starts, what agents see, what they earn.
 ///
-/// Flat buffers concatenate the agents in order: `observations` has `Σ observation` elements, `actions` `Σ action`.
+/// Flat buffers concatenate the agents in order: `observations` has `Σ observation` elements, `actions` `Σ action`. A
+/// `state` is a row `[shape().width()]` in [`Scenario::state_fields`] order, world units.
 pub trait Scenario: Send + Sync {
+    /// What every scenario has.
+    fn base(&self) -> &Base;
+
     /// Name, profile and every constant, resolved: what the manifest records, and what [`build`] accepts again.
     fn parameters(&self) -> Map<String, Value>;
 
-    /// Agents in order; `message` holds the default width (the sender's observation for communicators, else 0).
-    fn agents(&self) -> &[AgentSpec];
+    /// What the reward counts, in one line for tables: conventions differ by factors between papers.
+    fn reward_convention(&self) -> &'static str;
 
-    /// Names of the state vector's elements, in [`Scenario::state`] order.
-    fn state_fields(&self) -> Vec<String>;
+    /// Places all bodies for a new episode.
+    fn reset(&self, state: &mut [f64], rng: &mut Stream);
 
-    /// Steps in an episode (time limit).
-    fn steps(&self) -> usize {
-        25
+    /// Writes every agent's observation into the flat buffer.
+    fn observe(&self, state: &[f64], observations: &mut [f32]);
+
+    /// Writes the actions of the scripted agents (the prey) into the flat buffer; leaves the others alone.
+    fn scripted(&self, _state: &[f64], _rng: &mut Stream, _actions: &mut [f32]) {}
+
+    /// Writes the oracle's actions of the policy agents (a hand-written rule that sees the whole state).
+    fn oracle(&self, state: &[f64], actions: &mut [f32]);
+
+    /// Moves the world by one step of `dt` under all agents' actions and writes each agent's reward.
+    fn step(&self, state: &mut [f64], actions: &[f32], rewards: &mut [f32], scratch: &mut Scratch);
+
+    /// The team reward of a step, which a trainer optimises, from the agents' rewards.
+    fn team_reward(&self, rewards: &[f32]) -> f32 {
+        match self.base().team {
+            Team::First => rewards[0],
+            Team::Sum => rewards.iter().map(|&r| f64::from(r)).sum::<f64>() as f32,
+        }
     }
 
     /// World units in one unit of `distance` links by default (design §6).
@@ -57,41 +105,56 @@ pub trait Scenario: Send + Sync {
         0.25
     }
 
-    /// What the reward counts, in one line for tables: conventions differ by factors between papers.
-    fn reward_convention(&self) -> &'static str;
-
-    /// A world of this scenario's bodies, not yet placed.
-    fn world(&self) -> World;
-
-    /// Places all bodies for a new episode.
-    fn reset(&self, world: &mut World, rng: &mut Stream);
-
-    /// Writes every agent's observation into the flat buffer.
-    fn observe(&self, world: &World, observations: &mut [f32]);
-
-    /// Writes the actions of the scripted agents (the prey) into the flat buffer; leaves the others alone.
-    fn scripted(&self, world: &World, rng: &mut Stream, actions: &mut [f32]);
-
-    /// Writes the oracle's actions of the policy agents (a hand-written rule that sees the whole state).
-    fn oracle(&self, world: &World, actions: &mut [f32]);
-
-    /// The team reward of a step from the agents' rewards, where it follows from them.
-    fn team_reward(&self, _rewards: &[f32]) -> Option<f32> {
-        None
+    /// Agents in order.
+    fn agents(&self) -> &[AgentSpec] {
+        &self.base().agents
     }
 
-    /// Moves the world by one step of `dt` under all agents' actions and writes each agent's reward.
-    /// Returns the team reward that a trainer optimises.
-    fn step(&self, world: &mut World, actions: &[f32], rewards: &mut [f32]) -> f32;
+    /// What every agent can do.
+    fn space(&self) -> ActionSpace {
+        self.base().space
+    }
 
-    /// Writes the simulator state, in [`Scenario::state_fields`] order, world units.
-    fn state(&self, world: &World, out: &mut Vec<f64>) {
-        world.write_state(out);
+    /// Where everything lies in a row of state.
+    fn shape(&self) -> Shape {
+        self.base().physics.shape()
+    }
+
+    /// Names of the elements of a row of state.
+    fn state_fields(&self) -> Vec<String> {
+        self.shape().fields(self.agents())
+    }
+
+    /// Steps in an episode (time limit).
+    fn steps(&self) -> usize {
+        self.base().steps
     }
 
     /// The shape of its episodes.
     fn layout(&self) -> Layout {
         Layout { agents: self.agents().to_vec(), state_fields: self.state_fields() }
+    }
+
+    /// Checks a row of state that came from outside: as many elements as fields, finite, goals that exist.
+    ///
+    /// # Errors
+    /// One line that names the field and what is allowed.
+    fn check_state(&self, state: &[f64]) -> Result<(), String> {
+        let (shape, fields) = (self.shape(), self.state_fields());
+        if state.len() != fields.len() {
+            return Err(format!("state must have {} elements, found {}", fields.len(), state.len()));
+        }
+        if let Some((field, value)) = fields.iter().zip(state).find(|(_, v)| !v.is_finite()) {
+            return Err(format!("state field {field} must be finite, found {value}"));
+        }
+        let goals = if shape.goals { shape.agents } else { 0 };
+        for (field, &goal) in fields.iter().zip(state).skip(fields.len() - goals) {
+            if goal.fract() != 0.0 || !(0.0..shape.landmarks as f64).contains(&goal) {
+                let last = shape.landmarks - 1;
+                return Err(format!("state field {field} must be a landmark's number in [0, {last}], found {goal}"));
+            }
+        }
+        Ok(())
     }
 }
 
@@ -104,35 +167,25 @@ pub fn offsets(agents: &[AgentSpec], width: fn(&AgentSpec) -> usize) -> Vec<usiz
     offsets
 }
 
-/// Checks what every particle scenario takes: profile, number of agents, steps, laws of motion.
-fn check_common(spec: &Spec, profile: &str, agents: usize, steps: usize, laws: &Laws) -> Result<(), RegistryError> {
-    match profile {
-        "paper" => {}
-        "mpe2" => return Err(spec.invalid("profile \"mpe2\" is not there yet: use \"paper\"")),
-        other => return Err(spec.invalid(format!("unknown profile {other:?}: use \"paper\""))),
+/// An agent under policy control that learns and communicates.
+fn learner(name: String, team: &str, observation: usize, action: usize) -> AgentSpec {
+    AgentSpec {
+        name,
+        team: team.to_owned(),
+        controller: Controller::Policy,
+        learner: true,
+        communicator: true,
+        observation,
+        message: observation,
+        action,
     }
-    if !(1..=MAX_AGENTS).contains(&agents) {
-        return Err(spec.invalid(format!("agents must be in [1, {MAX_AGENTS}], found {agents}")));
-    }
-    if !(1..=10_000).contains(&steps) {
-        return Err(spec.invalid(format!("steps must be in [1, 10000], found {steps}")));
-    }
-    spec.in_range("dt", laws.dt, 1e-4, 1.0)?;
-    spec.in_range("damping", laws.damping, 0.0, 1.0)?;
-    spec.in_range("contact_force", laws.contact_force, 0.0, 1e4)?;
-    spec.in_range("contact_margin", laws.contact_margin, 1e-9, 1.0)
 }
 
-/// `x y vx vy` of the agents, then `x y` of `landmarks` landmarks.
-fn body_fields(agents: &[AgentSpec], landmarks: usize) -> Vec<String> {
-    let moving = agents.iter().flat_map(|a| ["x", "y", "vx", "vy"].map(|c| format!("{}.{c}", a.name)));
-    moving.chain((0..landmarks).flat_map(|l| ["x", "y"].map(|c| format!("landmark_{l}.{c}")))).collect()
-}
-
-/// Places bodies uniformly in the square of half width `half`, at rest.
-fn scatter(positions: &mut [[f64; 2]], half: f64, rng: &mut Stream) {
-    for p in positions {
-        *p = [crate::rng::uniform(rng, -half, half), crate::rng::uniform(rng, -half, half)];
+/// Puts bodies uniformly into the square of half width `half`.
+fn scatter(shape: Shape, state: &mut [f64], bodies: std::ops::Range<usize>, half: f64, rng: &mut Stream) {
+    for body in bodies {
+        let place = [crate::rng::uniform(rng, -half, half), crate::rng::uniform(rng, -half, half)];
+        shape.place(state, body, place);
     }
 }
 
@@ -141,15 +194,28 @@ struct Writer<'a> {
     rest: &'a mut [f32],
 }
 
-impl Writer<'_> {
-    fn pair(&mut self, pair: [f64; 2]) {
-        let (head, tail) = std::mem::take(&mut self.rest).split_at_mut(2);
-        head.copy_from_slice(&[pair[0] as f32, pair[1] as f32]);
+impl<'a> Writer<'a> {
+    /// A writer of the next `width` elements, which it takes from `rest`.
+    fn of(rest: &mut &'a mut [f32], width: usize) -> Self {
+        let (own, others) = std::mem::take(rest).split_at_mut(width);
+        *rest = others;
+        Writer { rest: own }
+    }
+
+    fn numbers(&mut self, numbers: &[f64]) {
+        let (head, tail) = std::mem::take(&mut self.rest).split_at_mut(numbers.len());
+        for (to, &from) in head.iter_mut().zip(numbers) {
+            *to = from as f32;
+        }
         self.rest = tail;
     }
 
+    fn pair(&mut self, pair: [f64; 2]) {
+        self.numbers(&pair);
+    }
+
     /// The offset from `body` to `other`, or zeros beyond the squared radius.
-    fn seen(&mut self, world: &World, body: usize, other: usize, squared_radius: f64) -> bool {
+    fn seen(&mut self, world: World<'_>, body: usize, other: usize, squared_radius: f64) -> bool {
         let d = world.offset(body, other);
         let seen = d[0] * d[0] + d[1] * d[1] <= squared_radius;
         self.pair(if seen { d } else { [0.0; 2] });

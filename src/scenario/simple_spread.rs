@@ -4,34 +4,38 @@
 //! # Definition
 //! Agents and landmarks start uniform in [-1, 1]², at rest. After each step agent i earns
 //! `r_i = −Σ_l min_a |p_a − p_l| − #{a : |p_a − p_i| < 2 size} + cover_bonus · [every landmark has an agent within
-//! cover_radius]`; the count includes i itself (`self_collision`). The team reward is the SUM of all `r_i`.
+//! cover_radius]`; the count includes i itself (`self_collision`). With a `local_ratio` λ (profile `mpe2`: 0.5, neither
+//! bonus nor self-collision) it is `(1 − λ)` times the shared and λ times the own part. The team reward is the SUM of all
+//! `r_i`.
 //!
 //! # Shapes and units
 //! Observation `4 + 2N + 4(N − 1)` (18 at N = 3), world units: own velocity, own position, landmarks relative, others
 //! relative (zeros beyond `view_radius`), and 2(N − 1) zeros where silent others' utterances would stand.
-//! Action 2 (`force2`) or 5 (`mpe5`). State: `x y vx vy` per agent, `x y` per landmark.
+//! Action 2 (`force2`) or 5 (`mpe5`, `mpe2`). State: `x y vx vy` per agent, `x y` per landmark.
 //!
 //! # Parameters
-//! See [`Params`]; `agents` is N. `view_radius` null sees everything; `max_speed` null is none.
+//! See [`Params`]; `agents` is N. `view_radius` `none` sees everything.
 //!
 //! # When it fails
 //! Observations take N² memory: at N = 1000 one episode is over a gigabyte. Two landmarks closer than `2 size` cannot
 //! both be covered without a collision.
 //!
 //! # Reference
-//! Lowe et al. 2017 (MPE `simple_spread`); PMIC's file for the bonus and the summed reward; arXiv 2512.03528.
+//! Lowe et al. 2017 (MPE `simple_spread`); PMIC's file for the bonus and the summed reward; arXiv 2512.03528. Profile
+//! `mpe2`: `simple_spread_v3` of mpe2 1.1.1, to whose trajectories it is held.
 //!
 //! # Differences from the reference implementation
 //! PMIC has no view radius; the paper adds one without giving it: others are masked at 0.25 here, landmarks are not.
-//! Two agents in exactly the same place do not push (there: NaN).
+//! Two agents in exactly the same place do not push (there: NaN). Of mpe2's options, `curriculum`, `terminate_on_success`
+//! and neighbour filters are not here.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use super::{Body, Build, Decoder, Integration, Laws, Physics, Scenario, World, Writer};
+use super::params::{Common, MAX_AGENTS, Maybe, Profile, read};
+use super::{Base, Body, Build, Physics, Scenario, Scratch, Team, Writer};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Stream;
-use crate::schema::{AgentSpec, Controller};
 
 /// The scenario's line in the registry.
 pub(super) const ENTRY: Entry<Build> = Entry {
@@ -44,38 +48,20 @@ pub(super) const ENTRY: Entry<Build> = Entry {
 
 /// Every constant of the task. Lengths in world units, speeds per second.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
 struct Params {
-    /// Only `paper` for now.
-    profile: String,
-    /// N, also the number of landmarks: 1 to 1000.
-    agents: usize,
-    /// T: 1 to 10000.
-    steps: usize,
-    /// From action to force.
-    decoder: Decoder,
-    /// Seconds in a step: [1e-4, 1].
-    dt: f64,
-    /// Share of velocity lost per step: [0, 1].
-    damping: f64,
-    /// Force per unit of overlap: [0, 1e4].
-    contact_force: f64,
-    /// Softness of contacts: [1e-9, 1].
-    contact_margin: f64,
-    /// Order of integration.
-    integration: Integration,
+    /// Profile, N (also the number of landmarks: 1 to 1000), laws of motion.
+    #[serde(flatten)]
+    common: Common,
     /// Gain from control to force: [0, 100].
     accel: f64,
     /// Top speed: (0, 100], or none.
-    max_speed: Option<f64>,
+    max_speed: Maybe,
     /// Radius of an agent: [0, 1].
     agent_size: f64,
     /// Whether agents push each other.
     collide: bool,
-    /// Half width of the square in which bodies start: [0, 100].
-    arena: f64,
     /// How far others are seen: [0, 1000], or everywhere.
-    view_radius: Option<f64>,
+    view_radius: Maybe,
     /// Whether `view_radius` hides landmarks too.
     mask_landmarks: bool,
     /// Reward lost per collision: [0, 1000].
@@ -86,148 +72,117 @@ struct Params {
     cover_radius: f64,
     /// Earned by each agent while all are covered: [-1000, 1000].
     cover_bonus: f64,
+    /// Weight of the agent's own part against the shared one: [0, 1], or none for their plain sum.
+    local_ratio: Maybe,
 }
 
-impl Default for Params {
-    fn default() -> Self {
+impl Params {
+    fn of(profile: Profile) -> Self {
+        let paper = profile == Profile::Paper;
         Self {
-            profile: "paper".to_owned(),
-            agents: 3,
-            steps: 25,
-            decoder: Decoder::Force2,
-            dt: 0.1,
-            damping: 0.25,
-            contact_force: 100.0,
-            contact_margin: 1e-3,
-            integration: Integration::VelocityFirst,
+            common: Common::of(profile, 3),
             accel: 5.0,
-            max_speed: None,
+            max_speed: Maybe(None),
             agent_size: 0.15,
             collide: true,
-            arena: 1.0,
-            view_radius: Some(0.25),
+            view_radius: Maybe(paper.then_some(0.25)),
             mask_landmarks: false,
             collision_penalty: 1.0,
-            self_collision: true,
+            self_collision: paper,
             cover_radius: 0.1,
-            cover_bonus: 1.0,
+            cover_bonus: if paper { 1.0 } else { 0.0 },
+            local_ratio: Maybe((!paper).then_some(0.5)),
         }
+    }
+
+    fn check(&self, spec: &Spec) -> Result<(), RegistryError> {
+        self.common.check(spec, 1, MAX_AGENTS)?;
+        spec.in_range("accel", self.accel, 0.0, 100.0)?;
+        self.max_speed.check(spec, "max_speed", f64::MIN_POSITIVE, 100.0)?;
+        spec.in_range("agent_size", self.agent_size, 0.0, 1.0)?;
+        self.view_radius.check(spec, "view_radius", 0.0, 1000.0)?;
+        spec.in_range("collision_penalty", self.collision_penalty, 0.0, 1000.0)?;
+        spec.in_range("cover_radius", self.cover_radius, 0.0, 10.0)?;
+        spec.in_range("cover_bonus", self.cover_bonus, -1000.0, 1000.0)?;
+        self.local_ratio.check(spec, "local_ratio", 0.0, 1.0)
     }
 }
 
 struct SimpleSpread {
     params: Params,
-    agents: Vec<AgentSpec>,
-    physics: Physics,
+    base: Base,
     /// Squared radii within which others and landmarks are seen.
     sees: [f64; 2],
 }
 
 fn build(spec: &Spec) -> Result<Box<dyn Scenario>, RegistryError> {
-    let p: Params = spec.params()?;
-    let laws = Laws {
-        dt: p.dt,
-        damping: p.damping,
-        contact_force: p.contact_force,
-        contact_margin: p.contact_margin,
-        integration: p.integration,
-    };
-    super::check_common(spec, &p.profile, p.agents, p.steps, &laws)?;
-    spec.in_range("accel", p.accel, 0.0, 100.0)?;
-    spec.in_range("max_speed", p.max_speed.unwrap_or(1.0), f64::MIN_POSITIVE, 100.0)?;
-    spec.in_range("agent_size", p.agent_size, 0.0, 1.0)?;
-    spec.in_range("arena", p.arena, 0.0, 100.0)?;
-    spec.in_range("view_radius", p.view_radius.unwrap_or(0.0), 0.0, 1000.0)?;
-    spec.in_range("collision_penalty", p.collision_penalty, 0.0, 1000.0)?;
-    spec.in_range("cover_radius", p.cover_radius, 0.0, 10.0)?;
-    spec.in_range("cover_bonus", p.cover_bonus, -1000.0, 1000.0)?;
-    let n = p.agents;
+    let p: Params = read(spec, Params::of)?;
+    p.check(spec)?;
+    let (n, space) = (p.common.agents, p.common.space(0));
     let observation = 4 + 2 * n + 4 * (n - 1);
-    let agents = (0..n).map(|i| AgentSpec {
-        name: format!("agent_{i}"),
-        team: "agents".to_owned(),
-        controller: Controller::Policy,
-        learner: true,
-        communicator: true,
-        observation,
-        message: observation,
-        action: p.decoder.width(),
-    });
-    let max_speed = p.max_speed.unwrap_or(f64::INFINITY);
-    let agent = Body { size: p.agent_size, accel: p.accel, max_speed, collide: p.collide };
+    let agent = Body { size: p.agent_size, accel: p.accel, max_speed: p.max_speed.or_infinite(), collide: p.collide };
     let landmark = Body { collide: false, ..agent };
-    let radius = p.view_radius.unwrap_or(f64::INFINITY);
+    let radius = p.view_radius.or_infinite();
+    let base = Base {
+        agents: (0..n).map(|i| super::learner(format!("agent_{i}"), "agents", observation, space.width())).collect(),
+        space,
+        physics: Physics::new(p.common.laws(), &vec![agent; n], &vec![landmark; n], 0, false),
+        steps: p.common.steps,
+        team: Team::Sum,
+    };
     let sees = [radius * radius, if p.mask_landmarks { radius * radius } else { f64::INFINITY }];
-    let physics = Physics::new(laws, &vec![agent; n], &vec![landmark; n]);
-    Ok(Box::new(SimpleSpread { agents: agents.collect(), physics, sees, params: p }))
+    Ok(Box::new(SimpleSpread { params: p, base, sees }))
 }
 
 impl Scenario for SimpleSpread {
+    fn base(&self) -> &Base {
+        &self.base
+    }
+
     fn parameters(&self) -> Map<String, Value> {
         crate::registry::resolved(ENTRY.name, &self.params)
     }
 
-    fn agents(&self) -> &[AgentSpec] {
-        &self.agents
-    }
-
-    fn state_fields(&self) -> Vec<String> {
-        super::body_fields(&self.agents, self.params.agents)
-    }
-
-    fn steps(&self) -> usize {
-        self.params.steps
-    }
-
     fn reward_convention(&self) -> &'static str {
-        "sum over agents of (−distances − collisions, self included, + bonus when all are covered)"
+        if self.params.local_ratio.0.is_some() {
+            "sum over agents of the mix (local_ratio) of −distances, shared, and −collisions, own"
+        } else {
+            "sum over agents of (−distances − collisions, self included, + bonus when all are covered)"
+        }
     }
 
-    fn team_reward(&self, rewards: &[f32]) -> Option<f32> {
-        Some(rewards.iter().map(|&r| f64::from(r)).sum::<f64>() as f32)
+    fn reset(&self, state: &mut [f64], rng: &mut Stream) {
+        state.fill(0.0);
+        super::scatter(self.shape(), state, 0..2 * self.params.common.agents, self.params.common.arena, rng);
     }
 
-    fn world(&self) -> World {
-        self.physics.world()
-    }
-
-    fn reset(&self, world: &mut World, rng: &mut Stream) {
-        super::scatter(&mut world.positions, self.params.arena, rng);
-        world.velocities.fill([0.0; 2]);
-    }
-
-    fn observe(&self, world: &World, observations: &mut [f32]) {
-        let n = self.params.agents;
-        for (i, row) in observations.chunks_exact_mut(4 + 2 * n + 4 * (n - 1)).enumerate() {
-            let mut out = Writer { rest: row };
-            out.pair(world.velocities[i]);
-            out.pair(world.positions[i]);
+    fn observe(&self, state: &[f64], mut observations: &mut [f32]) {
+        let (world, n) = (self.base.physics.world(state), self.params.common.agents);
+        for (i, agent) in self.base.agents.iter().enumerate() {
+            let mut out = Writer::of(&mut observations, agent.observation);
+            out.pair(world.velocity(i));
+            out.pair(world.position(i));
             (n..2 * n).for_each(|l| _ = out.seen(world, i, l, self.sees[1]));
             (0..n).filter(|&a| a != i).for_each(|a| _ = out.seen(world, i, a, self.sees[0]));
             out.rest.fill(0.0);
         }
     }
 
-    fn scripted(&self, _world: &World, _rng: &mut Stream, _actions: &mut [f32]) {}
-
     /// Each agent heads for the landmark that a shortest matching gives it, and brakes in time.
-    fn oracle(&self, world: &World, actions: &mut [f32]) {
-        let n = self.params.agents;
-        let targets = match_landmarks(n, &|a, l| world.squared_distance(a, n + l).sqrt());
-        let (kept, gain) = (1.0 - self.params.damping, (self.params.accel * self.params.dt).max(1e-9));
-        let bound = self.params.decoder.bound();
-        for (a, action) in actions.chunks_exact_mut(self.params.decoder.width()).enumerate() {
-            let d = world.offset(a, n + targets[a]);
-            let v = world.velocities[a];
-            // The wished velocity is proportional to the way left; the control is what gets there in one step.
-            let u = [0, 1].map(|c| ((5.0 * d[c] - kept * v[c]) / gain).clamp(-bound, bound));
-            self.params.decoder.encode(u, action);
+    fn oracle(&self, state: &[f64], actions: &mut [f32]) {
+        let Base { physics, space, .. } = &self.base;
+        let (world, n) = (physics.world(state), self.params.common.agents);
+        let targets = match_landmarks(n, &|a, l| world.distance(a, n + l));
+        for (a, action) in actions.chunks_exact_mut(space.width()).enumerate() {
+            let wish = world.offset(a, n + targets[a]).map(|c| 5.0 * c);
+            space.encode(physics.control_towards(a, world.velocity(a), wish, space.decoder.bound()), action);
         }
     }
 
-    fn step(&self, world: &mut World, actions: &[f32], rewards: &mut [f32]) -> f32 {
-        let (p, n) = (&self.params, self.params.agents);
-        self.physics.step(world, p.decoder, actions);
+    fn step(&self, state: &mut [f64], actions: &[f32], rewards: &mut [f32], scratch: &mut Scratch) {
+        let (p, n) = (&self.params, self.params.common.agents);
+        self.base.physics.step(state, self.base.space, actions, scratch);
+        let world = self.base.physics.world(state);
         let (mut shared, mut covered) = (0.0, true);
         for l in n..2 * n {
             let nearest = (0..n).map(|a| world.squared_distance(a, l)).fold(f64::INFINITY, f64::min).sqrt();
@@ -238,15 +193,12 @@ impl Scenario for SimpleSpread {
             shared += p.cover_bonus;
         }
         let reach = 4.0 * p.agent_size * p.agent_size;
-        let own = usize::from(p.self_collision && p.agent_size > 0.0);
-        let mut team = 0.0;
+        let itself = usize::from(p.self_collision && p.agent_size > 0.0);
+        let weights = p.local_ratio.0.map_or([1.0, 1.0], |own| [1.0 - own, own]);
         for (i, reward) in rewards.iter_mut().enumerate() {
-            let hits = (0..n).filter(|&a| a != i && world.squared_distance(a, i) < reach).count() + own;
-            let r = shared - p.collision_penalty * hits as f64;
-            *reward = r as f32;
-            team += r;
+            let hits = (0..n).filter(|&a| a != i && world.squared_distance(a, i) < reach).count() + itself;
+            *reward = (weights[0] * shared - weights[1] * p.collision_penalty * hits as f64) as f32;
         }
-        team as f32
     }
 }
 
@@ -311,44 +263,50 @@ mod tests {
         build(spec).unwrap()
     }
 
+    fn row(s: &dyn Scenario, places: &[[f64; 2]]) -> Vec<f64> {
+        let mut state = vec![0.0; s.shape().width()];
+        places.iter().enumerate().for_each(|(body, &place)| s.shape().place(&mut state, body, place));
+        state
+    }
+
     #[test]
     fn rewards_of_a_hand_made_world() {
         let s = scenario(&Spec::new("simple_spread"));
-        let mut world = s.world();
-        world.positions = vec![[0.0, 0.0], [0.29, 0.0], [5.0, 0.0], [0.0, 1.0], [0.29, 0.0], [5.0, 0.5]];
+        let mut state = row(&*s, &[[0.0, 0.0], [0.29, 0.0], [5.0, 0.0], [0.0, 1.0], [0.29, 0.0], [5.0, 0.5]]);
         let mut rewards = [0.0; 3];
         // The contact of agents 0 and 1 moves them apart by about 0.01 · 100 · 0.1² each within the step.
-        let team = s.step(&mut world, &[0.0; 6], &mut rewards);
-        let nearest = |l: usize| (0..3).map(|a| world.squared_distance(a, l).sqrt()).fold(9.0, f64::min);
+        s.step(&mut state, &[0.0; 6], &mut rewards, &mut Scratch::default());
+        let world = s.shape().world(&state);
+        let nearest = |l: usize| (0..3).map(|a| world.distance(a, l)).fold(9.0, f64::min);
         let distances = nearest(3) + nearest(4) + nearest(5);
         let hit = f64::from(u8::from(world.squared_distance(0, 1) < 0.09));
         assert!((f64::from(rewards[0]) + distances + 1.0 + hit).abs() < 1e-6);
         assert!((f64::from(rewards[2]) + distances + 1.0).abs() < 1e-6, "it collides with itself only");
-        assert!((team - rewards.iter().sum::<f32>()).abs() < 1e-5);
+        assert!((s.team_reward(&rewards) - rewards.iter().sum::<f32>()).abs() < 1e-5);
     }
 
     #[test]
     fn all_landmarks_covered_earns_the_bonus_and_self_collision_can_be_off() {
-        let mut world = scenario(&Spec::new("simple_spread")).world();
         let places = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]];
-        world.positions = [places, places].concat();
         for (own, expected) in [(true, 0.0), (false, 3.0)] {
             let s = scenario(&Spec::new("simple_spread").with("self_collision", own));
-            assert_eq!(s.step(&mut world.clone(), &[0.0; 6], &mut [0.0; 3]), expected);
+            let mut state = row(&*s, &[places, places].concat());
+            let mut rewards = [9.0; 3];
+            s.step(&mut state, &[0.0; 6], &mut rewards, &mut Scratch::default());
+            assert_eq!(s.team_reward(&rewards), expected);
         }
     }
 
     #[test]
     fn the_observation_masks_far_agents_but_not_landmarks() {
         let s = scenario(&Spec::new("simple_spread").with("agents", 2));
-        let mut world = s.world();
-        world.positions = vec![[0.5, 0.25], [0.5, 0.5], [3.0, 0.25], [0.5, -1.0]];
-        world.velocities[0] = [1.0, 2.0];
+        let mut state = row(&*s, &[[0.5, 0.25], [0.5, 0.5], [3.0, 0.25], [0.5, -1.0]]);
+        s.shape().push(&mut state, 0, [1.0, 2.0]);
         let mut seen = [9.0; 24];
-        s.observe(&world, &mut seen);
+        s.observe(&state, &mut seen);
         assert_eq!(seen[..12], [1.0, 2.0, 0.5, 0.25, 2.5, 0.0, 0.0, -1.25, 0.0, 0.25, 0.0, 0.0]);
-        world.positions[1] = [0.5, 0.51];
-        s.observe(&world, &mut seen);
+        s.shape().place(&mut state, 1, [0.5, 0.51]);
+        s.observe(&state, &mut seen);
         assert_eq!(seen[8..12], [0.0; 4], "beyond the view radius");
         assert_eq!(scenario(&Spec::new("simple_spread")).agents()[0].observation, 18);
     }

@@ -56,6 +56,15 @@ fn quantile_of_sorted(sorted: &[f64], p: f64) -> f64 {
     sorted[below] + (position - below as f64) * (sorted[above] - sorted[below])
 }
 
+/// Slope of the least-squares line through `(x, y)` points; NaN of fewer than two different x.
+pub fn slope(points: &[(f64, f64)]) -> f64 {
+    let n = points.len() as f64;
+    let (x, y) = (points.iter().map(|p| p.0).sum::<f64>() / n, points.iter().map(|p| p.1).sum::<f64>() / n);
+    let across: f64 = points.iter().map(|p| (p.0 - x) * (p.0 - x)).sum();
+    let together: f64 = points.iter().map(|p| (p.0 - x) * (p.1 - y)).sum();
+    if across > 0.0 { together / across } else { f64::NAN }
+}
+
 /// Interquartile mean: the mean after ⌊n/4⌋ values are cut from each end; NaN of nothing.
 pub fn iqm(values: &[f64]) -> f64 {
     let mut sorted = values.to_vec();

@@ -113,6 +113,11 @@ impl Findings<'_> {
         manifest
     }
 
+    /// What the episodes belong to, where there is no sealed manifest.
+    pub(super) fn describe(&mut self, manifest: &Manifest) {
+        self.report.manifest = Some(manifest.clone());
+    }
+
     /// Counts a sound episode, and asks the caller for its opinion.
     pub(super) fn episode(&mut self, episode: &Episode) {
         self.report.episodes += 1;
@@ -175,7 +180,7 @@ pub fn verify<'a>(path: &Path, watch: &'a mut Watch<'a>) -> Result<Report, Stora
 /// Reads all episodes as any reader does.
 fn read(path: &Path, findings: &mut Findings<'_>) -> Result<(), StorageError> {
     let mut source = super::open(path)?;
-    findings.report.manifest = Some(source.manifest().clone());
+    findings.describe(source.manifest());
     while let Some(episode) = source.next_episode()? {
         findings.episode(&episode);
     }
@@ -203,7 +208,7 @@ fn unfinished(leftover: &Path, target: &Path, findings: &mut Findings<'_>) -> Re
     let mut ended = String::new();
     match (format_of(target).build.salvage)(leftover) {
         Ok(mut source) => {
-            findings.report.manifest = Some(source.manifest().clone());
+            findings.describe(source.manifest());
             loop {
                 match source.next_episode() {
                     Ok(Some(episode)) => findings.episode(&episode),

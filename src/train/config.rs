@@ -197,13 +197,11 @@ impl TrainConfig {
     pub fn resolve(mut self) -> Result<Self, TrainError> {
         let preset = algo::preset(&self.algorithm)?;
         env!("CARGO_PKG_VERSION").clone_into(&mut self.ccmarl);
-        let parameters = crate::scenario::build(&self.scenario)?.parameters();
-        self.scenario = resolved(parameters.clone());
         let scenario = crate::scenario::build(&self.scenario)?;
-        let again = scenario.parameters();
-        if let Some((key, _)) = parameters.iter().find(|(key, value)| again.get(*key) != Some(*value)) {
-            let message = "null cannot be written in TOML; give a number (a radius of 1000 sees everything)".to_owned();
-            return Err(TrainError::Value { name: format!("scenario.{key}"), message });
+        self.scenario = resolved(scenario.parameters());
+        if scenario.space().discrete {
+            let message = "this learner's actions are continuous: set it to false".to_owned();
+            return Err(TrainError::Value { name: "scenario.discrete".to_owned(), message });
         }
         let prior = self.prior.take().unwrap_or(preset.prior);
         let setting = crate::link::Setting { distance_unit: scenario.link_unit() };

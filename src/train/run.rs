@@ -10,6 +10,7 @@ use super::replay::{Replay, Ring};
 use super::{TrainError, checkpoint};
 use crate::algo::{Batch, Maddpg, MaddpgConfig};
 use crate::link::{self, Link, Setting};
+use crate::nn::Activation;
 use crate::record::{ActionNoise, Recording, Trained, loss_rate};
 use crate::rng::Seeds;
 use crate::scenario::{self, Scenario};
@@ -103,7 +104,8 @@ impl Trainer {
         let layout = scenario.layout();
         let seeds = Seeds::new(config.seed).child("train");
         let learners: Vec<_> = layout.agents.iter().filter(|a| a.learner).collect();
-        let learner = Maddpg::new(&learners, config.maddpg.clone(), &seeds)?;
+        let output = if scenario.space().decoder.low() < 0.0 { Activation::Tanh } else { Activation::Sigmoid };
+        let learner = Maddpg::new(&learners, output, config.maddpg.clone(), &seeds)?;
         let replay = Replay::new(&layout, scenario.steps(), config.replay)?;
         let weights = config.weights();
         let shaped = weights.iter().any(|&w| w > 0.0) && learners.len() > 1;

@@ -1,41 +1,19 @@
-//! Benchmarks of the core: stepping worlds, rolling out episodes, one update of the learner.
+//! Benchmarks of the core: rolling out episodes, one update of the learner. `worlds.rs` has the worlds alone.
 #![expect(clippy::unwrap_used, reason = "a benchmark that cannot start may panic")]
 
-use std::hint::black_box;
 use std::path::Path;
 
 use ccmarl::link::{self, Setting};
 use ccmarl::record::{self, Recording};
 use ccmarl::registry::Spec;
-use ccmarl::rng::Seeds;
 use ccmarl::scenario;
 use ccmarl::train::{TrainConfig, Trainer};
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 
-fn steps(c: &mut Criterion) {
-    let mut group = c.benchmark_group("env step");
-    group.throughput(Throughput::Elements(1000));
-    for name in ["simple_spread", "simple_tag"] {
-        let scenario = scenario::build(&Spec::new(name)).unwrap();
-        let (mut world, mut rng) = (scenario.world(), Seeds::new(1).stream("bench"));
-        let mut actions = vec![0.3f32; scenario.agents().iter().map(|a| a.action).sum()];
-        let mut rewards = vec![0.0; scenario.agents().len()];
-        scenario.reset(&mut world, &mut rng);
-        group.bench_function(name, |b| {
-            b.iter(|| {
-                for _ in 0..1000 {
-                    scenario.scripted(&world, &mut rng, &mut actions);
-                    black_box(scenario.step(&mut world, &actions, &mut rewards));
-                }
-            });
-        });
-    }
-}
-
 fn episodes(c: &mut Criterion) {
     let mut group = c.benchmark_group("episode, steps");
     group.throughput(Throughput::Elements(25));
-    for name in ["simple_spread", "simple_tag"] {
+    for name in ["simple_spread", "simple_reference", "simple_adversary", "simple_tag"] {
         let scenario = scenario::build(&Spec::new(name)).unwrap();
         let setting = Setting { distance_unit: scenario.link_unit() };
         let link = link::build(&Spec::new("dropout").with("p", 0.2), &setting).unwrap();
@@ -76,5 +54,5 @@ fn updates(c: &mut Criterion) {
     }
 }
 
-criterion_group!(benches, steps, episodes, updates);
+criterion_group!(benches, episodes, updates);
 criterion_main!(benches);

@@ -42,6 +42,10 @@ fn data() -> Data {
         unit: "return per episode".to_owned(),
         series: series.iter().map(|s| (*s).to_owned()).collect(),
         curves: vec![curve("fc-maddpg", -139.0), curve("cc-maddpg", -129.0)],
+        costs: vec![Curve {
+            series: series[0].to_owned(),
+            points: [3.0, 100.0].map(|n| Point { step: n, value: n * n, band: None }).to_vec(),
+        }],
         bars: ["unrestricted", "mbc-light", "dbc-heavy", "none"]
             .iter()
             .flat_map(|c| [bar(c, "fc-maddpg", -139.0), bar(c, "cc-maddpg", -129.0)])

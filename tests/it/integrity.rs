@@ -341,25 +341,26 @@ fn two_writers_of_one_name_are_told_of_each_other() {
 #[test]
 fn every_form_converts_into_every_other_and_back_to_the_same_bytes() {
     let directory = tempfile::tempdir().unwrap();
-    let at = |name: String| directory.path().join(name);
     let (_, episodes) = golden();
     for from in FORMS {
         for to in FORMS {
-            let (there, back) = (at(format!("{from}-to-{to}")), at(format!("{from}-via-{to}-{from}")));
-            let manifest = convert(&golden_folder().join(from), &there, false).unwrap().unwrap();
+            let at = |step: usize, form: &str| directory.path().join(format!("{from}-{to}-{step}")).join(form);
+            let (there, back, again) = (at(0, to), at(1, from), at(3, from));
+            let source = golden_folder().join(from);
+            let manifest = convert(&source, &there, false).unwrap().unwrap();
             assert_eq!(read(&there).unwrap(), episodes, "{from} to {to}");
             assert_eq!(manifest.planned, 0);
             convert(&there, &back, false).unwrap();
-            let again = at(format!("{from}-again-{to}-{from}"));
-            convert(&back, &again, false).unwrap();
+            convert(&back, &at(2, to), false).unwrap();
+            convert(&at(2, to), &again, false).unwrap();
             assert!(fs::read(data_file(&again)).unwrap() == fs::read(data_file(&back)).unwrap(), "{from} via {to}");
-            let error = convert(&golden_folder().join(from), &there, false).unwrap_err();
+            let error = convert(&source, &there, false).unwrap_err();
             assert!(matches!(error, StorageError::Io(IoError::Exists(_))), "{error}");
-            convert(&golden_folder().join(from), &there, true).unwrap();
+            convert(&source, &there, true).unwrap();
+            let error = convert(&there, &there, true).unwrap_err();
+            assert!(matches!(error, StorageError::Io(IoError::Exists(_))), "onto itself, even with force: {error}");
         }
     }
-    let error = convert(&at("store-to-store".to_owned()), &at("store-to-store".to_owned()), true).unwrap_err();
-    assert!(matches!(error, StorageError::Io(IoError::Exists(_))), "onto itself, even with force: {error}");
 }
 
 #[test]
@@ -499,14 +500,10 @@ fn a_record_of_ten_gigabytes_in_a_small_file_is_an_error() {
 }
 
 /// Asks for two gigabytes in the first page header of a Parquet file.
-fn greedy(bytes: &mut Vec<u8>) {
-    // after "PAR1": field 1 (type) and field 2 (uncompressed size, zigzag), both i32
-    assert_eq!((bytes[4], bytes[5], bytes[6]), (0x15, 0, 0x15));
-    let end = (7..).find(|&i| bytes[i] < 128).unwrap();
-    assert_eq!(end, 8, "a size of two bytes");
-    // the header of the first column gets three bytes longer, so the claim is as large as two bytes can be: not enough;
-    // instead the third field is overwritten and the size takes its place
-    bytes[7..12].copy_from_slice(&[0xfe, 0xff, 0xff, 0xff, 0x0f]);
+fn greedy(bytes: &mut [u8]) {
+    assert_eq!((bytes[4], bytes[5], bytes[6]), (0x15, 0, 0x15), "field 1 is the type, field 2 the size in memory");
+    // 2^31 - 1 in zigzag, then field 3, the size in the file, and no further field
+    bytes[7..15].copy_from_slice(&[0xfe, 0xff, 0xff, 0xff, 0x0f, 0x15, 0x20, 0]);
 }
 
 #[test]

@@ -7,7 +7,7 @@ use assert_cmd::Command;
 use ccmarl::link::{self, LINKS, Link, Setting};
 use ccmarl::record::{Options, POLICIES, Policy, RecordError, Recording, build_policy};
 use ccmarl::registry::Spec;
-use ccmarl::scenario::{self, SCENARIOS, Scenario};
+use ccmarl::scenario::{self, SCENARIOS, Scenario, Scratch};
 use ccmarl::schema::{Episode, Manifest};
 use ccmarl::storage::{EpisodeSink, StorageError};
 use serde_json::Value;
@@ -73,7 +73,9 @@ fn record(recording: &Recording<'_>, threads: usize, block: usize) -> Vec<Episod
 #[test]
 fn every_policy_fills_every_scenario_and_its_parameters_build_it_again() {
     for (scenario, policy) in SCENARIOS.iter().flat_map(|s| examples().map(move |p| (s, p))) {
-        for agents in [1, 2, 4] {
+        // not every scenario takes every number; all take two
+        let taken = |n: &usize| *n == 2 || scenario::build(&Spec::new(scenario.name).with("agents", *n)).is_ok();
+        for agents in [1, 2, 4].into_iter().filter(taken) {
             let parts = Parts::new(scenario.name, agents, "dropout:0.5", policy);
             let recording = parts.recording(1, 3);
             let episode = recording.episode(2);
@@ -114,18 +116,12 @@ fn messages_are_what_was_sent_and_rows_replay_through_the_scenario() {
         assert_eq!(episode.messages[agent], episode.observations[agent], "sent before the channel");
     }
     assert_eq!(episode.messages[3].width, 0, "the prey is silent");
-    let (mut world, agents) = (parts.0.world(), 4);
-    for (a, p) in world.positions.iter_mut().enumerate() {
-        let at = if a < agents { 4 * a } else { 4 * agents + 2 * (a - agents) };
-        *p = [episode.state[at], episode.state[at + 1]];
-    }
-    let mut rewards = vec![0.0; agents];
+    let width = parts.0.shape().width();
+    let (mut state, mut rewards) = (episode.state[..width].to_vec(), vec![0.0; 4]);
     for t in 0..episode.steps {
         let actions: Vec<f32> = episode.actions.iter().flat_map(|m| m.row(t).to_vec()).collect();
-        assert_eq!(parts.0.step(&mut world, &actions, &mut rewards), episode.reward[t]);
-        let mut state = Vec::new();
-        parts.0.state(&world, &mut state);
-        let width = state.len();
+        parts.0.step(&mut state, &actions, &mut rewards, &mut Scratch::default());
+        assert_eq!(parts.0.team_reward(&rewards), episode.reward[t]);
         assert_eq!(state, episode.state[(t + 1) * width..(t + 2) * width]);
     }
 }

@@ -41,3 +41,10 @@ fn a_better_algorithm_has_a_probability_of_improvement_above_a_half() {
     assert!((p + probability_of_improvement(&worse, &better) - 1.0).abs() < 1e-12);
     assert!(mean(&better) > mean(&worse));
 }
+
+#[test]
+fn the_slope_of_a_line_is_its_slope_and_of_one_point_nothing() {
+    let line = [(0.0, 1.0), (1.0, 3.5), (4.0, 11.0)];
+    assert!((ccmarl::stats::slope(&line) - 2.5).abs() < 1e-12);
+    assert!(ccmarl::stats::slope(&line[..1]).is_nan());
+}

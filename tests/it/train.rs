@@ -201,10 +201,12 @@ fn configurations_are_refused_with_their_line_or_their_name() {
     assert_eq!(range, "maddpg.gamma: expected a value in [0, 1], found 1.5");
     let name = read("algorithm = \"madpg\"\nscenario = { name = \"simple_spread\" }\n").unwrap_err();
     assert!(name.contains("unknown algorithm \"madpg\": did you mean maddpg"), "{name}");
-    let mut blind = config("maddpg", 500);
-    blind.scenario = blind.scenario.with("view_radius", serde_json::Value::Null);
-    let null = blind.resolve().unwrap_err().to_string();
-    assert!(null.starts_with("scenario.view_radius: null cannot be written in TOML"), "{null}");
+    let sees_all = "algorithm = \"maddpg\"\nscenario = { name = \"simple_spread\", view_radius = \"none\" }\n";
+    assert_eq!(read(sees_all), Ok(()));
+    let mut choosing = config("maddpg", 500);
+    choosing.scenario = choosing.scenario.with("discrete", true).with("decoder", "mpe2");
+    let discrete = choosing.resolve().unwrap_err().to_string();
+    assert_eq!(discrete, "scenario.discrete: this learner's actions are continuous: set it to false");
     let scenario = read("algorithm = \"maddpg\"\nscenario = { name = \"simple_spread\", agnets = 3 }\n").unwrap_err();
     assert!(scenario.contains("unknown field `agnets`"), "{scenario}");
 }

@@ -13,7 +13,7 @@ use crate::scenario::World;
 const BLOCK: usize = 100;
 
 /// The prey's push: a point of the unit disc, or zero when every way is blocked.
-pub(super) fn choose(params: &Params, world: &World, rng: &mut Stream) -> [f64; 2] {
+pub(super) fn choose(params: &Params, world: World<'_>, rng: &mut Stream) -> [f64; 2] {
     let (mut best, mut push) = (f32::NEG_INFINITY, [0.0; 2]);
     let mut left = params.prey_candidates;
     while left > 0 {
@@ -44,8 +44,8 @@ fn fill_disc(x: &mut [f32], y: &mut [f32], rng: &mut Stream) {
     }
 }
 
-fn scores(params: &Params, world: &World, x: &[f32; BLOCK], y: &[f32; BLOCK]) -> [f32; BLOCK] {
-    let prey = params.agents;
+fn scores(params: &Params, world: World<'_>, x: &[f32; BLOCK], y: &[f32; BLOCK]) -> [f32; BLOCK] {
+    let prey = params.common.agents;
     let touch = (params.predator_size + params.prey_size) as f32;
     let mut score = [if params.prey_score == PreyScore::Sum { 0.0 } else { f32::INFINITY }; BLOCK];
     // Squared distance from the nearest predator on the way; a minimum vectorises, a flag does not.
@@ -88,6 +88,8 @@ fn less(a: f32, b: f32) -> f32 {
 mod tests {
     use super::*;
     use crate::rng::Seeds;
+    use crate::scenario::Shape;
+    use crate::scenario::params::Profile;
 
     #[test]
     fn candidates_are_uniform_in_the_disc() {
@@ -103,15 +105,17 @@ mod tests {
 
     #[test]
     fn the_choice_is_the_best_of_its_own_candidates() {
-        let params = Params { prey_candidates: 250, ..Params::default() };
-        let mut world = World::at_rest(4, 2);
-        world.positions[..4].copy_from_slice(&[[0.5, 0.2], [-0.3, 0.4], [0.1, -0.6], [0.0, 0.0]]);
-        let push = choose(&params, &world, &mut Seeds::new(2).stream("prey"));
+        let params = Params { prey_candidates: 250, ..Params::of(Profile::Paper) };
+        let shape = Shape { agents: 4, words: 0, landmarks: 0, goals: false };
+        let mut state = vec![0.0; shape.width()];
+        let predators = [[0.5, 0.2], [-0.3, 0.4], [0.1, -0.6]];
+        predators.into_iter().enumerate().for_each(|(a, place)| shape.place(&mut state, a, place));
+        let push = choose(&params, shape.world(&state), &mut Seeds::new(2).stream("prey"));
         let (mut x, mut y) = ([0.0; 250], [0.0; 250]);
         fill_disc(&mut x, &mut y, &mut Seeds::new(2).stream("prey"));
         let score = |p: [f32; 2]| -> f64 {
             let from = |a: usize, k: f64| {
-                let [x, y] = world.positions[a];
+                let [x, y] = predators[a];
                 libm::hypot(x - k * f64::from(p[0]), y - k * f64::from(p[1]))
             };
             let free = (0..3).all(|a| (1..=5).all(|k| from(a, f64::from(k) / 5.0) >= 0.125));

@@ -14,11 +14,11 @@ use crate::storage::{StorageError, Tally};
 /// Reports the checksums, the manifests and each chunk and episode that does not hold.
 pub(super) fn diagnose(path: &Path, findings: &mut Findings<'_>) -> Result<(), StorageError> {
     let plain = || LinearReaderOptions::default().with_check_finishes_after_end_magic(true);
-    let (mut recording, mut sealed) = (None, None);
+    let (mut recording, mut sealed, mut short) = (None, None, false);
     for options in [plain().with_validate_data_section_crc(true), plain().with_validate_summary_section_crc(true)] {
         match scan(path, options, &mut |_, _, _| {}) {
             Ok(found) => (recording, sealed) = (found.recording, found.manifest),
-            Err(Stop::Short) => findings.lost("length", "file", "it is cut short".to_owned()),
+            Err(Stop::Short) => short = true,
             Err(Stop::Error(StorageError::Damaged { message, .. })) => findings.wrong("checksum", "file", message),
             Err(Stop::Error(error)) => return Err(error),
         }
@@ -33,10 +33,15 @@ pub(super) fn diagnose(path: &Path, findings: &mut Findings<'_>) -> Result<(), S
         };
         scan(path, torn, &mut early).ok();
     }
-    let sealed = findings.manifest("metadata record ccmarl.manifest", sealed.as_deref());
+    if short {
+        findings.lost("length", "file", "it is cut short".to_owned());
+    }
+    // the sealed manifest stands at the end, so a file that was cut has none
+    let sealed = if short { None } else { findings.manifest("metadata record ccmarl.manifest", sealed.as_deref()) };
     let Some(manifest) = sealed.or_else(|| recording.and_then(|text| Manifest::parse_damaged(&text).ok())) else {
         return Ok(());
     };
+    findings.describe(&manifest);
     let mut total = Tally::default();
     episodes(path, &manifest, &mut total, findings)?;
     if findings.is_clean()
