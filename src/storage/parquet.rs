@@ -34,6 +34,7 @@ mod journal;
 mod pages;
 mod pairs;
 mod salvage;
+mod side_by_side;
 mod sink;
 mod source;
 

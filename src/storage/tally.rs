@@ -28,9 +28,13 @@ impl Tally {
 
     /// Checks the next episodes of a store, side by side, and returns their content hashes.
     pub(super) fn check_all(&self, layout: &Layout, episodes: &[Episode]) -> Result<Vec<[u8; 32]>, SchemaError> {
+        self.check_each(layout, episodes).into_iter().collect()
+    }
+
+    /// The same, one by one.
+    pub(super) fn check_each(&self, layout: &Layout, episodes: &[Episode]) -> Vec<Result<[u8; 32], SchemaError>> {
         let expected = (self.episodes..).zip(episodes).collect::<Vec<_>>();
-        let checked: Vec<_> = expected.into_par_iter().map(|(index, episode)| check(layout, episode, index)).collect();
-        checked.into_iter().collect() // the first error by index, whichever thread was first
+        expected.into_par_iter().map(|(index, episode)| check(layout, episode, index)).collect()
     }
 
     /// Counts an episode with this content hash.

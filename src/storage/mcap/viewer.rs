@@ -65,7 +65,7 @@ impl Viewer {
         let names = layout.state_fields.iter().filter_map(|field| field.strip_suffix(".x"));
         let others = names.filter(|name| layout.agents.iter().all(|agent| agent.name != *name));
         let landmark = |name: &str| {
-            let radius = radius(&manifest.scenario, &[kind(name)]);
+            let radius = radius(&manifest.scenario, &[kind(name), "obstacle"]);
             Some(Thing { at: place(name)?, radius, color: LANDMARK })
         };
         let landmarks = others.filter_map(landmark).collect();

@@ -6,13 +6,14 @@ use std::path::{Path, PathBuf};
 use arrow::array::{
     Array, ArrayRef, BooleanArray, FixedSizeListArray, Float32Array, Float64Array, Int32Array, Int64Array, RecordBatch,
 };
+use arrow::buffer::NullBuffer;
 use arrow::datatypes::{DataType, Field, Schema};
 use arrow::error::ArrowError;
-use parquet::arrow::ProjectionMask;
-use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+use parquet::arrow::arrow_reader::{ArrowReaderMetadata, ArrowReaderOptions};
 
 use super::columns::{row_bytes, schema};
 use super::pages::{PageFault, check_pages};
+use super::side_by_side::SideBySide;
 use crate::io::IoError;
 use crate::schema::{Episode, Layout};
 use crate::storage::StorageError;
@@ -40,16 +41,13 @@ impl Decoder {
     /// Opens a file and compares its columns with the layout.
     pub(super) fn open(path: &Path, layout: &Layout) -> Result<Self, StorageError> {
         let file = File::open(path).map_err(IoError::os("open", path))?;
-        let pages = file.try_clone().map_err(IoError::os("open", path))?;
-        let builder = guard(path, || ParquetRecordBatchReaderBuilder::try_new(file))?;
-        check_pages(&pages, builder.metadata(), PAGE_LIMIT).map_err(|fault| match fault {
+        let metadata = guard(path, || ArrowReaderMetadata::load(&file, ArrowReaderOptions::new()))?;
+        check_pages(&file, metadata.metadata(), PAGE_LIMIT).map_err(|fault| match fault {
             PageFault::Unreadable(message) | PageFault::Greedy(message) => damaged(path, message),
         })?;
-        let roots = roots(builder.schema(), layout, path)?;
+        let roots = roots(metadata.schema(), layout, path)?;
         let rows = (BATCH_BYTES / row_bytes(layout)).clamp(1, 8192) as usize;
-        let mask = ProjectionMask::roots(builder.parquet_schema(), roots);
-        let reader = guard(path, || builder.with_projection(mask).with_batch_size(rows).build())?;
-        Ok(Self::new(path, layout, Box::new(reader)))
+        Ok(Self::new(path, layout, Box::new(SideBySide::open(path, &metadata, &roots, rows)?)))
     }
 
     /// Reads the batches of a journal, whose columns are compared with the layout.
@@ -156,9 +154,13 @@ impl Batch {
         }
         let rest = sorted.split_off(5);
         let last: BooleanArray = typed(&sorted[3])?;
+        let acted = NullBuffer::new(!last.values());
         for (name, array) in columns[5..].iter().zip(&rest) {
             let nullable = name.starts_with("action.") || name.starts_with("reward");
-            if let Some(row) = (0..batch.num_rows()).find(|&r| nullable && array.is_null(r) != last.value(r)) {
+            if nullable
+                && array.nulls() != Some(&acted)
+                && let Some(row) = (0..batch.num_rows()).find(|&r| array.is_null(r) != last.value(r))
+            {
                 let step = typed::<Int32Array>(&sorted[1])?.value(row);
                 return Err(format!(
                     "column {name}: step {step}: null is for the last row of an episode, and only there"
@@ -224,7 +226,10 @@ impl Batch {
         }
         if let Some(array) = next(layout.communicators().len()) {
             let (values, width) = elements::<BooleanArray>(array)?;
-            e.link.extend((from * width..(from + n) * width).map(|i| values.value(i)));
+            if values.len() < (from + n) * width {
+                return Err("a list column is shorter than its rows".to_owned());
+            }
+            e.link.extend(values.values().slice(from * width, n * width).iter());
         }
         for (a, m) in layout.agents.iter().zip(&mut e.actions) {
             floats(next(a.action), acted, &mut m.data)?;

@@ -1,8 +1,10 @@
 //! Opening: a directory of parts, or one file. A digest is checked before anything is decoded.
 
+use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
+use std::thread::JoinHandle;
 
 use parquet::file::metadata::ParquetMetaDataReader;
 use sha2::{Digest as _, Sha256};
@@ -11,8 +13,52 @@ use super::decoder::{Decoder, guard};
 use super::pages::{PageFault, check_pages};
 use super::{FILE_SHA256_KEY, MANIFEST_FILE, MANIFEST_KEY, PART_KEY, find_file_digest};
 use crate::io::{self, IoError};
-use crate::schema::{Episode, Layout, Manifest, Part, SELF_SHA256_PLACEHOLDER, hex};
+use crate::schema::{Episode, Layout, Manifest, Part, SELF_SHA256_PLACEHOLDER, SchemaError, hex};
 use crate::storage::{EpisodeSource, MANIFEST_LIMIT, StorageError, Tally};
+
+/// Rows that are decoded and checked ahead, unless one episode has more.
+const AHEAD_ROWS: usize = 8192;
+
+/// Reads some episodes ahead, so that they are checked side by side.
+struct Ahead {
+    decoder: Decoder,
+    ready: VecDeque<(Episode, Result<[u8; 32], SchemaError>)>,
+    /// What came after the episodes that are ready.
+    fault: Option<StorageError>,
+}
+
+impl Ahead {
+    fn new(decoder: Decoder) -> Self {
+        Self { decoder, ready: VecDeque::new(), fault: None }
+    }
+
+    /// The next episode of the store of which `total` was read, and its content hash; `None` at the end of the file.
+    fn next(
+        &mut self,
+        total: &Tally,
+        layout: &Layout,
+    ) -> Result<Option<(Episode, Result<[u8; 32], SchemaError>)>, StorageError> {
+        if self.ready.is_empty() && self.fault.is_none() {
+            let (mut episodes, mut rows) = (Vec::new(), 0);
+            while rows < AHEAD_ROWS && self.fault.is_none() {
+                match self.decoder.next_episode(total.episodes + episodes.len() as u64) {
+                    Ok(Some(episode)) => {
+                        rows += episode.rows();
+                        episodes.push(episode);
+                    }
+                    Ok(None) => break,
+                    Err(fault) => self.fault = Some(fault),
+                }
+            }
+            let hashes = total.check_each(layout, &episodes);
+            self.ready = episodes.into_iter().zip(hashes).collect();
+        }
+        match (self.ready.pop_front(), &self.fault) {
+            (None, Some(_)) => self.fault.take().map_or(Ok(None), Err),
+            (ready, _) => Ok(ready),
+        }
+    }
+}
 
 /// A directory of parts.
 pub(super) struct Parts {
@@ -21,7 +67,9 @@ pub(super) struct Parts {
     layout: Layout,
     next_part: usize,
     /// The open part, and what was read of it.
-    current: Option<(Decoder, Tally)>,
+    current: Option<(Ahead, Tally)>,
+    /// The digest of the next part, in the making.
+    digest: Option<(usize, JoinHandle<Result<(String, u64), IoError>>)>,
     total: Tally,
 }
 
@@ -62,6 +110,7 @@ impl Parts {
             layout,
             next_part: 0,
             current: None,
+            digest: None,
             total: Tally::default(),
         })
     }
@@ -73,8 +122,12 @@ impl Parts {
         };
         let path = self.directory.join(&part.file);
         check_part(&path, part)?;
-        self.current = Some((Decoder::open(&path, &self.layout)?, Tally::default()));
+        self.current = Some((Ahead::new(Decoder::open(&path, &self.layout)?), Tally::default()));
         self.next_part += 1;
+        self.digest = self.manifest.parts.get(self.next_part).map(|next| {
+            let path = self.directory.join(&next.file);
+            (self.next_part, std::thread::spawn(move || io::sha256_file(&path)))
+        });
         Ok(true)
     }
 }
@@ -107,8 +160,7 @@ impl EpisodeSource for Parts {
             };
             let part = &self.manifest.parts[self.next_part - 1];
             let path = self.directory.join(&part.file);
-            if let Some(episode) = decoder.next_episode(self.total.episodes)? {
-                let hash = self.total.check(&self.layout, &episode);
+            if let Some((episode, hash)) = decoder.next(&self.total, &self.layout)? {
                 let hash = hash.map_err(|source| StorageError::Schema { source, path })?;
                 tally.add(&episode, &hash);
                 self.total.add(&episode, &hash);
@@ -129,7 +181,7 @@ pub(super) struct Single {
     path: PathBuf,
     manifest: Manifest,
     layout: Layout,
-    decoder: Option<Decoder>,
+    decoder: Option<Ahead>,
     total: Tally,
 }
 
@@ -150,7 +202,7 @@ impl Single {
             let (episodes, steps) = (manifest.episodes, manifest.steps);
             return Err(damaged(format!("{episodes} episodes of {steps} steps do not give its {rows} rows")));
         }
-        let decoder = Some(Decoder::open(path, &layout)?);
+        let decoder = Some(Ahead::new(Decoder::open(path, &layout)?));
         Ok(Self { path: path.to_owned(), manifest, layout, decoder, total: Tally::default() })
     }
 }
@@ -162,8 +214,7 @@ impl EpisodeSource for Single {
 
     fn next_episode(&mut self) -> Result<Option<Episode>, StorageError> {
         let Some(decoder) = &mut self.decoder else { return Ok(None) };
-        if let Some(episode) = decoder.next_episode(self.total.episodes)? {
-            let hash = self.total.check(&self.layout, &episode);
+        if let Some((episode, hash)) = decoder.next(&self.total, &self.layout)? {
             let hash = hash.map_err(|source| StorageError::Schema { source, path: self.path.clone() })?;
             self.total.add(&episode, &hash);
             return Ok(Some(episode));
