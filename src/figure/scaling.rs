@@ -2,7 +2,7 @@
 //! Cost against size on two logarithmic axes, one line per series, its exponent in the legend.
 //!
 //! # Definition
-//! One line per [`Curve`](crate::figure::Curve): the size is `Point::step`, the cost `Point::value`. A straight line of
+//! One line per [`Curve`]: the size is `Point::step`, the cost `Point::value`. A straight line of
 //! slope k is cost ∝ size^k; the legend gives the slope of the least-squares line through the logarithms.
 //!
 //! # Shapes and units
@@ -37,10 +37,12 @@ pub(super) const ENTRY: Entry<Render> = Entry {
 
 const NAME: &str = "scaling";
 
+/// A curve's legend, colour and the logarithms of its points.
+type Line = (String, RGBColor, Vec<(f64, f64)>);
+
 struct Figure<'a> {
     data: &'a Data,
-    /// Per curve: its legend, colour and the logarithms of its points.
-    lines: Vec<(String, RGBColor, Vec<(f64, f64)>)>,
+    lines: Vec<Line>,
     sizes: std::ops::Range<f64>,
     costs: std::ops::Range<f64>,
 }

@@ -189,19 +189,22 @@ fn scatter(shape: Shape, state: &mut [f64], bodies: std::ops::Range<usize>, half
     }
 }
 
+/// A writer per agent, over its part of the flat buffer of observations.
+fn writers<'a>(agents: &[AgentSpec], observations: &'a mut [f32]) -> impl Iterator<Item = (usize, Writer<'a>)> {
+    let mut rest = observations;
+    agents.iter().enumerate().map(move |(i, agent)| {
+        let (own, others) = std::mem::take(&mut rest).split_at_mut(agent.observation);
+        rest = others;
+        (i, Writer { rest: own })
+    })
+}
+
 /// Writes numbers one after the other into a flat observation buffer.
 struct Writer<'a> {
     rest: &'a mut [f32],
 }
 
-impl<'a> Writer<'a> {
-    /// A writer of the next `width` elements, which it takes from `rest`.
-    fn of(rest: &mut &'a mut [f32], width: usize) -> Self {
-        let (own, others) = std::mem::take(rest).split_at_mut(width);
-        *rest = others;
-        Writer { rest: own }
-    }
-
+impl Writer<'_> {
     fn numbers(&mut self, numbers: &[f64]) {
         let (head, tail) = std::mem::take(&mut self.rest).split_at_mut(numbers.len());
         for (to, &from) in head.iter_mut().zip(numbers) {

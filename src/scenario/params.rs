@@ -106,7 +106,7 @@ pub(super) fn read<P: Serialize + DeserializeOwned>(spec: &Spec, of: fn(Profile)
     let profile = match spec.params.get("profile") {
         None => Profile::Paper,
         Some(named) => serde_json::from_value(named.clone())
-            .map_err(|_| spec.invalid(format!("profile must be \"paper\" or \"mpe2\", found {named}")))?,
+            .map_err(|_error| spec.invalid(format!("profile must be \"paper\" or \"mpe2\", found {named}")))?,
     };
     spec.params_over(&of(profile))
 }

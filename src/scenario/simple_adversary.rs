@@ -30,7 +30,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::params::{Common, MAX_AGENTS, Maybe, Profile, read};
-use super::{Base, Body, Build, Physics, Scenario, Scratch, Team, Writer};
+use super::{Base, Body, Build, Physics, Scenario, Scratch, Team};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::{Stream, below};
 
@@ -157,10 +157,9 @@ impl Scenario for SimpleAdversary {
         super::scatter(self.shape(), state, 0..2 * n - 1, self.params.common.arena, rng);
     }
 
-    fn observe(&self, state: &[f64], mut observations: &mut [f32]) {
+    fn observe(&self, state: &[f64], observations: &mut [f32]) {
         let (world, n) = (self.base.physics.world(state), self.params.common.agents);
-        for (i, agent) in self.base.agents.iter().enumerate() {
-            let mut out = Writer::of(&mut observations, agent.observation);
+        for (i, mut out) in super::writers(&self.base.agents, observations) {
             let goal = (i > 0).then(|| world.goal(i));
             for other in goal.into_iter().chain(n..2 * n - 1).chain((0..n).filter(|&a| a != i)) {
                 out.pair(world.offset(i, other));

@@ -33,7 +33,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::params::{Common, Maybe, Profile, read};
-use super::{Base, Body, Build, Physics, Scenario, Scratch, Team, Writer};
+use super::{Base, Body, Build, Physics, Scenario, Scratch, Team};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::{Stream, below};
 
@@ -180,11 +180,10 @@ impl Scenario for SimpleReference {
         super::scatter(self.shape(), state, 0..AGENTS + LANDMARKS, self.params.common.arena, rng);
     }
 
-    fn observe(&self, state: &[f64], mut observations: &mut [f32]) {
+    fn observe(&self, state: &[f64], observations: &mut [f32]) {
         let world = self.base.physics.world(state);
-        for (i, agent) in self.base.agents.iter().enumerate() {
+        for (i, mut out) in super::writers(&self.base.agents, observations) {
             let other = AGENTS - 1 - i;
-            let mut out = Writer::of(&mut observations, agent.observation);
             out.pair(world.velocity(i));
             for landmark in AGENTS..AGENTS + LANDMARKS {
                 out.pair(world.offset(i, landmark));

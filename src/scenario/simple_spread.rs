@@ -33,7 +33,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::params::{Common, MAX_AGENTS, Maybe, Profile, read};
-use super::{Base, Body, Build, Physics, Scenario, Scratch, Team, Writer};
+use super::{Base, Body, Build, Physics, Scenario, Scratch, Team};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Stream;
 
@@ -156,10 +156,9 @@ impl Scenario for SimpleSpread {
         super::scatter(self.shape(), state, 0..2 * self.params.common.agents, self.params.common.arena, rng);
     }
 
-    fn observe(&self, state: &[f64], mut observations: &mut [f32]) {
+    fn observe(&self, state: &[f64], observations: &mut [f32]) {
         let (world, n) = (self.base.physics.world(state), self.params.common.agents);
-        for (i, agent) in self.base.agents.iter().enumerate() {
-            let mut out = Writer::of(&mut observations, agent.observation);
+        for (i, mut out) in super::writers(&self.base.agents, observations) {
             out.pair(world.velocity(i));
             out.pair(world.position(i));
             (n..2 * n).for_each(|l| _ = out.seen(world, i, l, self.sees[1]));

@@ -37,7 +37,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use super::params::{Common, MAX_AGENTS, Maybe, Profile, read};
-use super::{Base, Body, Build, Physics, Scenario, Scratch, Team, World, Writer};
+use super::{Base, Body, Build, Physics, Scenario, Scratch, Team, World};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Stream;
 use crate::schema::{AgentSpec, Controller};
@@ -242,11 +242,10 @@ impl Scenario for SimpleTag {
         super::scatter(shape, state, agents..agents + shape.landmarks, self.params.obstacle_arena, rng);
     }
 
-    fn observe(&self, state: &[f64], mut observations: &mut [f32]) {
+    fn observe(&self, state: &[f64], observations: &mut [f32]) {
         let (world, prey) = (self.base.physics.world(state), self.prey());
-        for (i, agent) in self.base.agents.iter().enumerate() {
+        for (i, mut out) in super::writers(&self.base.agents, observations) {
             let sees = if i == prey { f64::INFINITY } else { self.sees };
-            let mut out = Writer::of(&mut observations, agent.observation);
             out.pair(world.velocity(i));
             out.pair(world.position(i));
             (prey + 1..=prey + self.params.obstacles).for_each(|o| _ = out.seen(world, i, o, sees));

@@ -9,12 +9,13 @@ use std::fmt::Write as _;
 use std::time::{Duration, Instant};
 
 use ccmarl::figure::{Curve, Data, FIGURES, Point, svg};
+use ccmarl::io::write_atomic;
 use ccmarl::registry::{Spec, find};
 use ccmarl::rng::{Seeds, Stream};
 use ccmarl::scenario::{Worlds, build};
 
-/// CPU time of one measurement, at least: a hundred times what Linux counts it in.
-const LONG: Duration = Duration::from_millis(400);
+/// Seconds of CPU time of one measurement, at least: a hundred times what Linux counts it in.
+const LONG: f64 = 0.4;
 
 /// Steps between two looks at the clock, at least.
 const STEPS: usize = 5000;
@@ -58,9 +59,9 @@ fn main() {
         data.costs.push(Curve { series: name.to_owned(), points });
     }
     if let Some(dir) = out {
-        std::fs::create_dir_all(&dir).unwrap();
-        std::fs::write(dir.join("worlds.csv"), csv).unwrap();
-        std::fs::write(dir.join("cost.svg"), svg(find("figure", FIGURES, "scaling").unwrap(), &data).unwrap()).unwrap();
+        let figure = svg(find("figure", FIGURES, "scaling").unwrap(), &data).unwrap();
+        write_atomic(&dir.join("worlds.csv"), csv.as_bytes()).unwrap();
+        write_atomic(&dir.join("cost.svg"), figure.as_bytes()).unwrap();
     }
 }
 
@@ -78,9 +79,9 @@ fn measure(spec: &Spec, count: usize) -> f64 {
     let mut actions: Vec<Vec<f32>> = drawn.chunks_exact(count * total(|a| a.action)).map(<[f32]>::to_vec).collect();
     let mut best = f64::INFINITY;
     for _ in 0..REPEATS {
-        let start = cpu_time();
+        let start = cpu_seconds();
         let mut taken = 0;
-        while cpu_time() - start < LONG {
+        while cpu_seconds() - start < LONG {
             let next = taken + STEPS;
             while taken < next {
                 for (world, rng) in rngs.iter_mut().enumerate() {
@@ -94,18 +95,18 @@ fn measure(spec: &Spec, count: usize) -> f64 {
                 taken += 25 * count;
             }
         }
-        best = best.min((cpu_time() - start).as_secs_f64() / taken as f64);
+        best = best.min((cpu_seconds() - start) / taken as f64);
     }
     assert!(observations.iter().chain(&rewards).all(|v| v.is_finite()));
     1.0 / best
 }
 
-/// CPU time of this process's first thread where Linux tells it, else the clock.
-fn cpu_time() -> Duration {
+/// Seconds of CPU time of this process's first thread where Linux tells it, else of the clock.
+fn cpu_seconds() -> f64 {
     static START: std::sync::OnceLock<Instant> = std::sync::OnceLock::new();
     let told = std::fs::read_to_string("/proc/self/schedstat").ok();
     match told.and_then(|text| text.split(' ').next()?.parse().ok()) {
-        Some(nanoseconds) => Duration::from_nanos(nanoseconds),
-        None => START.get_or_init(Instant::now).elapsed(),
+        Some(nanoseconds) => Duration::from_nanos(nanoseconds).as_secs_f64(),
+        None => START.get_or_init(Instant::now).elapsed().as_secs_f64(),
     }
 }

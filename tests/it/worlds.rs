@@ -398,9 +398,11 @@ fn mean_return(scenario: &Spec, policy: &str, episodes: u64) -> (f64, f64) {
     (mean, (variance / n).sqrt())
 }
 
-/// Returns of random and oracle policies that `tests/reference/paper_worlds.py` (numpy, 4000 episodes, seed 1) found:
-/// parameter, policy, mean, standard error.
-const REFERENCE: &[(&str, &[(&str, f64)], &str, f64, f64)] = &[
+/// Scenario, parameters, policy, mean return, its standard error.
+type Row = (&'static str, &'static [(&'static str, f64)], &'static str, f64, f64);
+
+/// Returns of random and oracle policies that `tests/reference/paper_worlds.py` (numpy, 4000 episodes, seed 1) found.
+const REFERENCE: &[Row] = &[
     ("simple_spread", &[], "random", -229.198, 0.721),
     ("simple_spread", &[], "scripted", -52.640, 0.368),
     ("simple_spread", &[("cover_bonus", 0.0)], "scripted", -103.899, 0.266),

@@ -49,7 +49,9 @@ impl Counts {
         }
         let mut floats = |column: &str, data: &[f32]| {
             let sum = self.sum(column);
-            data.iter().for_each(|&v| sum.add(f64::from(v)));
+            for &value in data {
+                sum.add(f64::from(value));
+            }
         };
         floats("reward", &e.reward);
         for (i, agent) in layout.agents.iter().enumerate() {
