@@ -124,7 +124,9 @@ mod tests {
 
     fn sum(values: &[f64]) -> ExactSum {
         let mut sum = ExactSum::default();
-        values.iter().for_each(|&v| sum.add(v));
+        for &value in values {
+            sum.add(value);
+        }
         sum
     }
 

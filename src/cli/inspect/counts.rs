@@ -45,11 +45,15 @@ impl Counts {
         }
         if !layout.state_fields.is_empty() {
             let sum = self.sum("state");
-            e.state.iter().for_each(|&v| sum.add(v));
+            for &value in &e.state {
+                sum.add(value);
+            }
         }
         let mut floats = |column: &str, data: &[f32]| {
             let sum = self.sum(column);
-            data.iter().for_each(|&v| sum.add(f64::from(v)));
+            for &value in data {
+                sum.add(f64::from(value));
+            }
         };
         floats("reward", &e.reward);
         for (i, agent) in layout.agents.iter().enumerate() {

@@ -10,6 +10,12 @@ pub(super) const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/
 pub(super) const VIEWER_DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/viewer.binpb"));
 
 /// Foxglove's messages.
+#[expect(
+    clippy::enum_variant_names,
+    clippy::doc_markdown,
+    clippy::trivially_copy_pass_by_ref,
+    reason = "generated code"
+)]
 pub(super) mod foxglove {
     include!(concat!(env!("OUT_DIR"), "/foxglove.rs"));
 }

@@ -58,9 +58,10 @@ impl PairsWriter {
             Field::new("receiver", DataType::Utf8, false),
             Field::new("delivered", DataType::Boolean, false),
         ];
-        fields.extend([("message", &block.message), ("action", &block.action)].iter().filter_map(|(name, list)| {
-            (list.width > 0)
-                .then(|| Field::new(*name, DataType::FixedSizeList(list.element(), list.width as i32), false))
+        let lists = [("message", &block.message), ("action", &block.action)];
+        fields.extend(lists.iter().filter(|(_, list)| list.width > 0).map(|(name, list)| {
+            let kind = DataType::FixedSizeList(list.element(), list.width as i32);
+            Field::new(*name, kind, false)
         }));
         let schema = Arc::new(Schema::new(fields));
         let json = Manifest { parts: Vec::new(), ..manifest.clone() }.sealed_json();
@@ -149,7 +150,7 @@ impl Block {
     fn new(layout: &Layout) -> Self {
         let communicators = layout.communicators();
         let widths = |width: fn(&crate::schema::AgentSpec) -> usize| {
-            Lists::new(communicators.iter().map(|&a| width(&layout.agents[a])).collect())
+            Lists::new(&communicators.iter().map(|&a| width(&layout.agents[a])).collect::<Vec<_>>())
         };
         Self {
             episode: Vec::new(),
@@ -193,7 +194,7 @@ struct Lists {
 }
 
 impl Lists {
-    fn new(widths: Vec<usize>) -> Self {
+    fn new(widths: &[usize]) -> Self {
         let width = widths.iter().copied().max().unwrap_or(0);
         let ragged = widths.iter().any(|&w| w != width);
         Self { width, ragged, values: Vec::new(), there: Vec::new() }

@@ -19,10 +19,15 @@ use crate::storage::{EpisodeSource, MANIFEST_LIMIT, StorageError, Tally};
 /// Rows that are decoded and checked ahead, unless one episode has more.
 const AHEAD_ROWS: usize = 8192;
 
+/// An episode, and its content hash or what is wrong with it.
+type Checked = (Episode, Result<[u8; 32], SchemaError>);
+/// The digest and size of a file, in the making.
+type FileDigest = JoinHandle<Result<(String, u64), IoError>>;
+
 /// Reads some episodes ahead, so that they are checked side by side.
 struct Ahead {
     decoder: Decoder,
-    ready: VecDeque<(Episode, Result<[u8; 32], SchemaError>)>,
+    ready: VecDeque<Checked>,
     /// What came after the episodes that are ready.
     fault: Option<StorageError>,
 }
@@ -33,11 +38,7 @@ impl Ahead {
     }
 
     /// The next episode of the store of which `total` was read, and its content hash; `None` at the end of the file.
-    fn next(
-        &mut self,
-        total: &Tally,
-        layout: &Layout,
-    ) -> Result<Option<(Episode, Result<[u8; 32], SchemaError>)>, StorageError> {
+    fn next(&mut self, total: &Tally, layout: &Layout) -> Result<Option<Checked>, StorageError> {
         if self.ready.is_empty() && self.fault.is_none() {
             let (mut episodes, mut rows) = (Vec::new(), 0);
             while rows < AHEAD_ROWS && self.fault.is_none() {
@@ -69,7 +70,7 @@ pub(super) struct Parts {
     /// The open part, and what was read of it.
     current: Option<(Ahead, Tally)>,
     /// The digest of the next part, in the making.
-    digest: Option<(usize, JoinHandle<Result<(String, u64), IoError>>)>,
+    digest: Option<(usize, FileDigest)>,
     total: Tally,
 }
 
