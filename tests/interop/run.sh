@@ -49,3 +49,11 @@ rm -f "$work/tag/store.rrd"
 "$bin/rerun" mcap convert "$work/tag/store.mcap" -o "$work/tag/store.rrd" >/dev/null 2>&1
 "$bin/rerun" rrd verify "$work/tag/store.rrd" >/dev/null 2>&1
 "$bin/python" tests/interop/read_scene.py "$work/tag/store.mcap" "$work/tag/store.rrd"
+
+# what mpe2 does with a seed that no golden store has, written by Python, played again step by step
+rm -rf "$work/mpe2"
+PYTHONDONTWRITEBYTECODE=1 "$bin/python" datasets/golden/mpe2/record.py "$work/mpe2" --seed 7 >/dev/null
+for store in "$work"/mpe2/*; do
+    ccmarl verify "$store" --resimulate >/dev/null
+done
+echo "ok mpe2 1.1.1: $(ls "$work/mpe2" | wc -l) stores written by Python play again within 1e-9 and 1e-6"

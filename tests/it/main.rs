@@ -1,6 +1,7 @@
 //! The one integration binary. `cfg(test)` tells clippy that helper functions are tests too: they may unwrap and print.
 #![cfg(test)]
 
+mod allocations;
 mod architecture;
 mod cli;
 mod estimate_mi;

@@ -11,6 +11,8 @@ use ccmarl::schema::{Episode, Manifest};
 use ccmarl::storage::{EpisodeSource, StorageError};
 use serde_json::Value;
 
+use crate::allocations::allocations;
+
 /// Every scenario in every profile, decoder and kind of action; `agents` where the scenario lets one choose.
 fn every_kind(agents: usize) -> Vec<Spec> {
     let mut all = Vec::new();
@@ -261,17 +263,20 @@ fn many_worlds_step_as_one_by_one() {
         }
         let (mut actions, mut rewards) = (vec![0.0; count * wide], vec![0.0; count * agents]);
         let mut team = vec![0.0; count];
-        for _ in 0..30 {
-            for (action, rng) in actions.chunks_exact_mut(wide).zip(&mut rngs) {
-                for action in action.chunks_exact_mut(s.space().width()) {
-                    s.space().sample(rng, action);
-                }
-            }
-            worlds.scripted(&mut rngs, &mut actions);
-            worlds.step(&actions, &mut rewards, &mut team);
-        }
         let mut observations = vec![f32::NAN; count * total(&*s, |a| a.observation)];
-        worlds.observe(&mut observations);
+        for step in 0..30 {
+            let allocated = allocations(|| {
+                for (action, rng) in actions.chunks_exact_mut(wide).zip(&mut rngs) {
+                    for action in action.chunks_exact_mut(s.space().width()) {
+                        s.space().sample(rng, action);
+                    }
+                }
+                worlds.scripted(&mut rngs, &mut actions);
+                worlds.step(&actions, &mut rewards, &mut team);
+                worlds.observe(&mut observations);
+            });
+            assert!(step == 0 || allocated == 0, "{spec}: {allocated} allocations in step {step}");
+        }
         assert_eq!(worlds.len(), count);
         for (w, (seen, earned)) in
             observations.chunks_exact(observations.len() / count).zip(rewards.chunks_exact(agents)).enumerate()

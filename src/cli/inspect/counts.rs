@@ -45,7 +45,9 @@ impl Counts {
         }
         if !layout.state_fields.is_empty() {
             let sum = self.sum("state");
-            e.state.iter().for_each(|&v| sum.add(v));
+            for &value in &e.state {
+                sum.add(value);
+            }
         }
         let mut floats = |column: &str, data: &[f32]| {
             let sum = self.sum(column);

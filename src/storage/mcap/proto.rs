@@ -11,8 +11,8 @@ pub(super) const VIEWER_DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DI
 
 /// Foxglove's messages.
 #[expect(
-    clippy::doc_markdown,
     clippy::enum_variant_names,
+    clippy::doc_markdown,
     clippy::trivially_copy_pass_by_ref,
     reason = "generated code"
 )]

@@ -58,11 +58,11 @@ impl PairsWriter {
             Field::new("receiver", DataType::Utf8, false),
             Field::new("delivered", DataType::Boolean, false),
         ];
-        for (name, list) in [("message", &block.message), ("action", &block.action)] {
-            if list.width > 0 {
-                fields.push(Field::new(name, DataType::FixedSizeList(list.element(), list.width as i32), false));
-            }
-        }
+        let lists = [("message", &block.message), ("action", &block.action)];
+        fields.extend(lists.iter().filter(|(_, list)| list.width > 0).map(|(name, list)| {
+            let kind = DataType::FixedSizeList(list.element(), list.width as i32);
+            Field::new(*name, kind, false)
+        }));
         let schema = Arc::new(Schema::new(fields));
         let json = Manifest { parts: Vec::new(), ..manifest.clone() }.sealed_json();
         let json = json.map_err(|source| StorageError::Schema { source, path: path.to_owned() })?;

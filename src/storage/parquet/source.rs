@@ -19,11 +19,10 @@ use crate::storage::{EpisodeSource, MANIFEST_LIMIT, StorageError, Tally};
 /// Rows that are decoded and checked ahead, unless one episode has more.
 const AHEAD_ROWS: usize = 8192;
 
-/// An episode with its content hash, or what is wrong with it.
+/// An episode, and its content hash or what is wrong with it.
 type Checked = (Episode, Result<[u8; 32], SchemaError>);
-
-/// SHA-256 and size of a file, in the making.
-type Digesting = JoinHandle<Result<(String, u64), IoError>>;
+/// The digest and size of a file, in the making.
+type FileDigest = JoinHandle<Result<(String, u64), IoError>>;
 
 /// Reads some episodes ahead, so that they are checked side by side.
 struct Ahead {
@@ -71,7 +70,7 @@ pub(super) struct Parts {
     /// The open part, and what was read of it.
     current: Option<(Ahead, Tally)>,
     /// The digest of the next part, in the making.
-    digest: Option<(usize, Digesting)>,
+    digest: Option<(usize, FileDigest)>,
     total: Tally,
 }
 
