@@ -37,6 +37,7 @@ mod salvage;
 mod side_by_side;
 mod sink;
 mod source;
+mod twins;
 
 use std::path::Path;
 

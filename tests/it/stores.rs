@@ -628,6 +628,25 @@ fn cpu() -> f64 {
     (fields[11].parse::<f64>().unwrap() + fields[12].parse::<f64>().unwrap()) / 100.0
 }
 
+#[test]
+fn messages_that_equal_observations_for_a_while_or_throughout_come_back() {
+    let layout = layout(&[(true, [2, 2, 1]), (true, [2, 2, 1])], 1);
+    // three blocks of rows; the second agent's messages change in the middle of the second
+    let mut episodes: Vec<Episode> = (0..900).map(|i| episode(&layout, i, 25, false)).collect();
+    for (index, e) in episodes.iter_mut().enumerate() {
+        e.messages.clone_from(&e.observations);
+        if index >= 450 {
+            e.messages[1].data[7] += 1.0;
+        }
+    }
+    for form in ["store", "store.parquet"] {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join(form);
+        write(&path, &layout, &episodes, false).unwrap();
+        assert_eq!(read(&path).unwrap(), episodes);
+    }
+}
+
 /// Speed of writing and reading rollouts as wide as `simple_spread` with three agents.
 #[test]
 #[ignore = "measures"]

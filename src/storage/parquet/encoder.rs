@@ -12,14 +12,14 @@ use std::thread::JoinHandle;
 use arrow::array::RecordBatch;
 use arrow::datatypes::SchemaRef;
 use parquet::arrow::ArrowWriter;
-use parquet::arrow::arrow_writer::ArrowColumnChunk;
 use parquet::errors::ParquetError;
 use parquet::file::metadata::KeyValue;
 use parquet::file::writer::SerializedFileWriter;
 use sha2::{Digest as _, Sha256};
 
 use super::columns::properties;
-use super::group::Group;
+use super::group::{Chunk, Group};
+use super::twins::renamed;
 use super::{FILE_SHA256_KEY, find_file_digest};
 use crate::io::IoError;
 use crate::schema::{SELF_SHA256_PLACEHOLDER, hex};
@@ -28,7 +28,7 @@ use crate::storage::StorageError;
 /// What the thread is told to do, in order.
 enum Job {
     /// A row group.
-    Group(Vec<ArrowColumnChunk>),
+    Group(Vec<Chunk>),
     /// The file ends here; its metadata, and the journal that it makes superfluous.
     EndFile(Vec<KeyValue>, Option<PathBuf>),
 }
@@ -140,10 +140,14 @@ fn assemble(
     Ok(sealed)
 }
 
-fn append(writer: &mut SerializedFileWriter<HashingFile>, chunks: Vec<ArrowColumnChunk>) -> Result<(), ParquetError> {
+fn append(writer: &mut SerializedFileWriter<HashingFile>, chunks: Vec<Chunk>) -> Result<(), ParquetError> {
+    let columns = writer.schema_descr().columns().to_vec();
     let mut group = writer.next_row_group()?;
-    for chunk in chunks {
-        chunk.append_to_row_group(&mut group)?;
+    for (chunk, column) in chunks.into_iter().zip(columns) {
+        match chunk {
+            Chunk::Own(chunk) => chunk.append_to_row_group(&mut group)?,
+            Chunk::Twin(pages, known) => group.append_column(&pages, renamed(&known, column)?)?,
+        }
     }
     group.close().map(drop)
 }
