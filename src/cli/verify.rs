@@ -65,18 +65,23 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         bar.set_length(manifest.episodes.max(manifest.planned));
         bar.inc(1);
         let wrong = rewards(scenario.get_or_insert_with(|| scenario_of(manifest)).as_deref(), episode);
+        let wrong = wrong.map(|message| ("rewards", message));
         if !args.resimulate {
             return wrong;
         }
-        match again.get_or_insert_with(|| Resimulation::of(manifest)) {
-            Ok(again) => again.play(episode).err().map(|e| e.to_string()).or(wrong),
-            Err(error) => Some(error.to_string()),
-        }
+        // what cannot be played again is said once, below
+        let again = again.get_or_insert_with(|| Resimulation::of(manifest)).as_mut().ok()?;
+        again.play(episode).err().map(|e| ("resimulation", e.to_string())).or(wrong)
     };
     let report = storage::verify(&args.store, &mut watch);
     bar.finish_and_clear();
     let mut report = report.map_err(Error::from)?;
-    let differences = again.and_then(Result::ok).map(Resimulation::differences);
+    let again = again.transpose().unwrap_or_else(|error| {
+        let (place, message) = ("manifest".to_owned(), error.to_string());
+        report.problems.push(Problem { check: "resimulation", place, message, lost: false });
+        None
+    });
+    let differences = again.map(Resimulation::differences);
     for column in differences.iter().flatten().filter(|column| !column.holds()) {
         let Difference { column, largest, tolerance, episode, step } = column;
         report.problems.push(Problem {

@@ -53,8 +53,8 @@ impl Report {
     }
 }
 
-/// A caller's look at an episode: a text says what is wrong with it.
-pub type Watch<'a> = dyn FnMut(&Manifest, &Episode) -> Option<String> + 'a;
+/// A caller's look at an episode: what was checked, and what is wrong with it.
+pub type Watch<'a> = dyn FnMut(&Manifest, &Episode) -> Option<(&'static str, String)> + 'a;
 
 /// Collects what is found.
 pub(super) struct Findings<'a> {
@@ -123,8 +123,8 @@ impl Findings<'_> {
         self.report.episodes += 1;
         self.report.steps += episode.steps as u64;
         let Some(manifest) = self.report.manifest.take() else { return };
-        if let Some(message) = (self.watch)(&manifest, episode) {
-            self.wrong("rewards", &format!("episode {}", episode.index), message);
+        if let Some((check, message)) = (self.watch)(&manifest, episode) {
+            self.wrong(check, &format!("episode {}", episode.index), message);
         }
         self.report.manifest = Some(manifest);
     }

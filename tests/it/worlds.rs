@@ -464,6 +464,8 @@ fn the_command_resimulates_stores_of_other_programs_and_tells_a_wrong_constant()
     };
     let slow = wrong("slow", serde_json::json!({"name": "simple_spread", "dt": 0.05}));
     assert!(slow.contains("resimulation") && slow.contains("allowed is 1e-9"), "{slow}");
+    let unknown = wrong("unknown", serde_json::json!({"name": "simple_tga"}));
+    assert!(unknown.contains("unknown scenario \"simple_tga\": did you mean simple_tag"), "{unknown}");
     let other = wrong("other", serde_json::json!({"name": "simple_tag"}));
     assert!(other.contains("the store does not fit the scenario that its manifest names"), "{other}");
 }
