@@ -54,6 +54,18 @@ pub struct Base {
     pub team: Team,
 }
 
+impl Base {
+    /// Actions with which every agent heads for a body and brakes in time: for oracles.
+    fn head_for(&self, state: &[f64], actions: &mut [f32], target: impl Fn(usize) -> usize) {
+        let (space, world) = (self.space, self.physics.world(state));
+        for (agent, action) in actions.chunks_exact_mut(space.width()).enumerate() {
+            let wish = world.offset(agent, target(agent)).map(|c| 5.0 * c);
+            let bound = space.decoder.bound();
+            space.encode(self.physics.control_towards(agent, world.velocity(agent), wish, bound), action);
+        }
+    }
+}
+
 /// What a team earns, from what its agents earn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Team {

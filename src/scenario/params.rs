@@ -3,7 +3,7 @@
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-use super::{ActionSpace, Decoder, Integration, Laws};
+use super::{ActionSpace, Body, Decoder, Integration, Laws};
 use crate::registry::{RegistryError, Spec};
 
 /// Most agents of a scenario: observations grow as the square of it.
@@ -98,6 +98,38 @@ impl Common {
 
     pub(super) fn space(&self, words: usize) -> ActionSpace {
         ActionSpace { decoder: self.decoder, discrete: self.discrete, words }
+    }
+}
+
+/// The bodies of the agents, where all are alike.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(super) struct AgentBodies {
+    /// Gain from control to force: [0, 100].
+    pub(super) accel: f64,
+    /// Top speed: (0, 100], or none.
+    pub(super) max_speed: Maybe,
+    /// Radius of an agent: [0, 1].
+    pub(super) agent_size: f64,
+    /// Whether bodies push each other.
+    pub(super) collide: bool,
+}
+
+impl AgentBodies {
+    /// Bodies of this size, with the gain of the original code and no top speed.
+    pub(super) fn of(agent_size: f64, collide: bool) -> Self {
+        Self { accel: 5.0, max_speed: Maybe(None), agent_size, collide }
+    }
+
+    /// Checks every range.
+    pub(super) fn check(&self, spec: &Spec) -> Result<(), RegistryError> {
+        spec.in_range("accel", self.accel, 0.0, 100.0)?;
+        self.max_speed.check(spec, "max_speed", f64::MIN_POSITIVE, 100.0)?;
+        spec.in_range("agent_size", self.agent_size, 0.0, 1.0)
+    }
+
+    pub(super) fn body(&self) -> Body {
+        let Self { accel, max_speed, agent_size: size, collide } = *self;
+        Body { size, accel, max_speed: max_speed.or_infinite(), collide }
     }
 }
 

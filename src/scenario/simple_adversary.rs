@@ -29,7 +29,7 @@
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use super::params::{Common, MAX_AGENTS, Maybe, Profile, read};
+use super::params::{AgentBodies, Common, MAX_AGENTS, Profile, read};
 use super::{Base, Body, Build, Physics, Scenario, Scratch, Team};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::{Stream, below};
@@ -69,16 +69,11 @@ struct Params {
     /// Profile, N (2 to 1000), laws of motion.
     #[serde(flatten)]
     common: Common,
-    /// Gain from control to force: [0, 100].
-    accel: f64,
-    /// Top speed: (0, 100], or none.
-    max_speed: Maybe,
-    /// Radius of an agent: [0, 1].
-    agent_size: f64,
+    /// Gain, top speed and radius of the agents, and whether they push each other.
+    #[serde(flatten)]
+    bodies: AgentBodies,
     /// Radius of a landmark: [0, 1].
     landmark_size: f64,
-    /// Whether agents push each other.
-    collide: bool,
     /// What the adversary loses.
     adversary_loss: Loss,
     /// What the team earns.
@@ -90,11 +85,8 @@ impl Params {
         let paper = profile == Profile::Paper;
         Self {
             common: Common::of(profile, 3),
-            accel: 5.0,
-            max_speed: Maybe(None),
-            agent_size: 0.15,
+            bodies: AgentBodies::of(0.15, false),
             landmark_size: 0.08,
-            collide: false,
             adversary_loss: if paper { Loss::Squared } else { Loss::Distance },
             team_reward: if paper { TeamReward::Adversary } else { TeamReward::Sum },
         }
@@ -102,9 +94,7 @@ impl Params {
 
     fn check(&self, spec: &Spec) -> Result<(), RegistryError> {
         self.common.check(spec, 2, MAX_AGENTS)?;
-        spec.in_range("accel", self.accel, 0.0, 100.0)?;
-        self.max_speed.check(spec, "max_speed", f64::MIN_POSITIVE, 100.0)?;
-        spec.in_range("agent_size", self.agent_size, 0.0, 1.0)?;
+        self.bodies.check(spec)?;
         spec.in_range("landmark_size", self.landmark_size, 0.0, 1.0)
     }
 }
@@ -118,7 +108,7 @@ fn build(spec: &Spec) -> Result<Box<dyn Scenario>, RegistryError> {
     let p: Params = read(spec, Params::of)?;
     p.check(spec)?;
     let (n, space) = (p.common.agents, p.common.space(0));
-    let agent = Body { size: p.agent_size, accel: p.accel, max_speed: p.max_speed.or_infinite(), collide: p.collide };
+    let agent = p.bodies.body();
     let landmark = Body { size: p.landmark_size, collide: false, ..agent };
     let adversary = super::learner("adversary_0".to_owned(), "adversaries", 4 * (n - 1), space.width());
     let good = |i| super::learner(format!("agent_{i}"), "good", 2 + 4 * (n - 1), space.width());
@@ -169,12 +159,7 @@ impl Scenario for SimpleAdversary {
 
     /// Everyone heads for the goal, the adversary too.
     fn oracle(&self, state: &[f64], actions: &mut [f32]) {
-        let Base { physics, space, .. } = &self.base;
-        let world = physics.world(state);
-        for (a, action) in actions.chunks_exact_mut(space.width()).enumerate() {
-            let wish = world.offset(a, world.goal(a)).map(|c| 5.0 * c);
-            space.encode(physics.control_towards(a, world.velocity(a), wish, space.decoder.bound()), action);
-        }
+        self.base.head_for(state, actions, |agent| self.base.physics.world(state).goal(agent));
     }
 
     fn step(&self, state: &mut [f64], actions: &[f32], rewards: &mut [f32], scratch: &mut Scratch) {

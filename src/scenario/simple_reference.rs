@@ -32,7 +32,7 @@
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use super::params::{Common, Maybe, Profile, read};
+use super::params::{AgentBodies, Common, Profile, read};
 use super::{Base, Body, Build, Physics, Scenario, Scratch, Team};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::{Stream, below};
@@ -68,16 +68,11 @@ struct Params {
     /// Profile, N (2), laws of motion.
     #[serde(flatten)]
     common: Common,
-    /// Gain from control to force: [0, 100].
-    accel: f64,
-    /// Top speed: (0, 100], or none.
-    max_speed: Maybe,
-    /// Radius of an agent: [0, 1].
-    agent_size: f64,
+    /// Gain, top speed and radius of the agents, and whether they and the landmarks push each other.
+    #[serde(flatten)]
+    bodies: AgentBodies,
     /// Radius of a landmark: [0, 1].
     landmark_size: f64,
-    /// Whether agents and landmarks push each other.
-    collide: bool,
     /// Width of an utterance: 0 to 100.
     words: usize,
     /// Whether nobody speaks.
@@ -99,11 +94,8 @@ impl Params {
         let paper = profile == Profile::Paper;
         Self {
             common: Common::of(profile, AGENTS),
-            accel: 5.0,
-            max_speed: Maybe(None),
-            agent_size: 0.05,
+            bodies: AgentBodies::of(0.05, paper),
             landmark_size: 0.05,
-            collide: paper,
             words: if paper { 2 } else { 10 },
             silent: false,
             reward: if paper { Reward::Overlap } else { Reward::Distance },
@@ -116,9 +108,7 @@ impl Params {
 
     fn check(&self, spec: &Spec) -> Result<(), RegistryError> {
         self.common.check(spec, AGENTS, AGENTS)?;
-        spec.in_range("accel", self.accel, 0.0, 100.0)?;
-        self.max_speed.check(spec, "max_speed", f64::MIN_POSITIVE, 100.0)?;
-        spec.in_range("agent_size", self.agent_size, 0.0, 1.0)?;
+        self.bodies.check(spec)?;
         spec.in_range("landmark_size", self.landmark_size, 0.0, 1.0)?;
         spec.in_range("words", self.words as f64, 0.0, 100.0)?;
         spec.in_range("cover_radius", self.cover_radius, 0.0, 10.0)?;
@@ -138,7 +128,7 @@ fn build(spec: &Spec) -> Result<Box<dyn Scenario>, RegistryError> {
     p.check(spec)?;
     let words = if p.silent { 0 } else { p.words };
     let space = p.common.space(words);
-    let agent = Body { size: p.agent_size, accel: p.accel, max_speed: p.max_speed.or_infinite(), collide: p.collide };
+    let agent = p.bodies.body();
     let landmark = Body { size: p.landmark_size, ..agent };
     let observation = 2 + 2 * LANDMARKS + 3 + p.words;
     let named = |i| super::learner(format!("agent_{i}"), "agents", observation, space.width());
@@ -198,12 +188,7 @@ impl Scenario for SimpleReference {
 
     /// Each agent heads for its own goal.
     fn oracle(&self, state: &[f64], actions: &mut [f32]) {
-        let Base { physics, space, .. } = &self.base;
-        let world = physics.world(state);
-        for (a, action) in actions.chunks_exact_mut(space.width()).enumerate() {
-            let wish = world.offset(a, world.goal(a)).map(|c| 5.0 * c);
-            space.encode(physics.control_towards(a, world.velocity(a), wish, space.decoder.bound()), action);
-        }
+        self.base.head_for(state, actions, |agent| self.base.physics.world(state).goal(agent));
     }
 
     fn step(&self, state: &mut [f64], actions: &[f32], rewards: &mut [f32], scratch: &mut Scratch) {

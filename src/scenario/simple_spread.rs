@@ -32,7 +32,7 @@
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use super::params::{Common, MAX_AGENTS, Maybe, Profile, read};
+use super::params::{AgentBodies, Common, MAX_AGENTS, Maybe, Profile, read};
 use super::{Base, Body, Build, Physics, Scenario, Scratch, Team};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Stream;
@@ -52,14 +52,9 @@ struct Params {
     /// Profile, N (also the number of landmarks: 1 to 1000), laws of motion.
     #[serde(flatten)]
     common: Common,
-    /// Gain from control to force: [0, 100].
-    accel: f64,
-    /// Top speed: (0, 100], or none.
-    max_speed: Maybe,
-    /// Radius of an agent: [0, 1].
-    agent_size: f64,
-    /// Whether agents push each other.
-    collide: bool,
+    /// Gain, top speed and radius of the agents, and whether they push each other.
+    #[serde(flatten)]
+    bodies: AgentBodies,
     /// How far others are seen: [0, 1000], or everywhere.
     view_radius: Maybe,
     /// Whether `view_radius` hides landmarks too.
@@ -81,10 +76,7 @@ impl Params {
         let paper = profile == Profile::Paper;
         Self {
             common: Common::of(profile, 3),
-            accel: 5.0,
-            max_speed: Maybe(None),
-            agent_size: 0.15,
-            collide: true,
+            bodies: AgentBodies::of(0.15, true),
             view_radius: Maybe(paper.then_some(0.25)),
             mask_landmarks: false,
             collision_penalty: 1.0,
@@ -97,9 +89,7 @@ impl Params {
 
     fn check(&self, spec: &Spec) -> Result<(), RegistryError> {
         self.common.check(spec, 1, MAX_AGENTS)?;
-        spec.in_range("accel", self.accel, 0.0, 100.0)?;
-        self.max_speed.check(spec, "max_speed", f64::MIN_POSITIVE, 100.0)?;
-        spec.in_range("agent_size", self.agent_size, 0.0, 1.0)?;
+        self.bodies.check(spec)?;
         self.view_radius.check(spec, "view_radius", 0.0, 1000.0)?;
         spec.in_range("collision_penalty", self.collision_penalty, 0.0, 1000.0)?;
         spec.in_range("cover_radius", self.cover_radius, 0.0, 10.0)?;
@@ -120,7 +110,7 @@ fn build(spec: &Spec) -> Result<Box<dyn Scenario>, RegistryError> {
     p.check(spec)?;
     let (n, space) = (p.common.agents, p.common.space(0));
     let observation = 4 + 2 * n + 4 * (n - 1);
-    let agent = Body { size: p.agent_size, accel: p.accel, max_speed: p.max_speed.or_infinite(), collide: p.collide };
+    let agent = p.bodies.body();
     let landmark = Body { collide: false, ..agent };
     let radius = p.view_radius.or_infinite();
     let base = Base {
@@ -169,13 +159,9 @@ impl Scenario for SimpleSpread {
 
     /// Each agent heads for the landmark that a shortest matching gives it, and brakes in time.
     fn oracle(&self, state: &[f64], actions: &mut [f32]) {
-        let Base { physics, space, .. } = &self.base;
-        let (world, n) = (physics.world(state), self.params.common.agents);
+        let (world, n) = (self.base.physics.world(state), self.params.common.agents);
         let targets = match_landmarks(n, &|a, l| world.distance(a, n + l));
-        for (a, action) in actions.chunks_exact_mut(space.width()).enumerate() {
-            let wish = world.offset(a, n + targets[a]).map(|c| 5.0 * c);
-            space.encode(physics.control_towards(a, world.velocity(a), wish, space.decoder.bound()), action);
-        }
+        self.base.head_for(state, actions, |agent| n + targets[agent]);
     }
 
     fn step(&self, state: &mut [f64], actions: &[f32], rewards: &mut [f32], scratch: &mut Scratch) {
@@ -191,8 +177,9 @@ impl Scenario for SimpleSpread {
         if covered {
             shared += p.cover_bonus;
         }
-        let reach = 4.0 * p.agent_size * p.agent_size;
-        let itself = usize::from(p.self_collision && p.agent_size > 0.0);
+        let size = p.bodies.agent_size;
+        let reach = 4.0 * size * size;
+        let itself = usize::from(p.self_collision && size > 0.0);
         let weights = p.local_ratio.0.map_or([1.0, 1.0], |own| [1.0 - own, own]);
         for (i, reward) in rewards.iter_mut().enumerate() {
             let hits = (0..n).filter(|&a| a != i && world.squared_distance(a, i) < reach).count() + itself;

@@ -21,7 +21,7 @@ use super::twins::{Keeper, candidates, equal};
 /// An encoded column of a row group.
 pub(super) enum Chunk {
     /// As it was encoded.
-    Own(ArrowColumnChunk),
+    Own(Box<ArrowColumnChunk>),
     /// The pages of another column that holds the same, and what is known of them.
     Twin(Bytes, Box<ColumnCloseResult>),
 }
@@ -105,7 +105,7 @@ impl Group {
         let known: Vec<Option<ColumnCloseResult>> =
             closed.iter().map(|chunk| chunk.as_ref().ok().map(|chunk| chunk.close().clone())).collect();
         let chunk = |chunk| match chunk {
-            Ok(own) => Ok(Chunk::Own(own)),
+            Ok(own) => Ok(Chunk::Own(Box::new(own))),
             Err(of) => {
                 let known: &Option<ColumnCloseResult> = &known[of];
                 let known = known.clone().ok_or_else(|| ParquetError::General(format!("column {of} has no chunk")))?;
