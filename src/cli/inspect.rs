@@ -10,7 +10,7 @@ use serde_json::Value;
 
 use super::{Outcome, ui};
 use crate::Error;
-use crate::io::{read_text, refuse_existing, write_atomic};
+use crate::io::{IoError, read_text, refuse_existing, write_atomic};
 use crate::schema::AgentSpec;
 use crate::stats::{mean, sd};
 use crate::storage::{self, StorageError};
@@ -149,6 +149,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let whole = if let Some(store) = &args.store {
         if let Some(out) = &args.out {
             refuse_existing(out, args.force).map_err(Error::from)?;
+            if out.exists() && !read_text(out, PART_LIMIT).is_ok_and(|text| Part::parse(&text).is_ok()) {
+                return Err(Error::from(IoError::Foreign(out.clone())).into());
+            }
         }
         let shard = args.shard.unwrap_or([0, 1]);
         let part = count(store, shard).map_err(Error::from)?;

@@ -39,10 +39,17 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if let Some(ended) = &recovered.ended {
         ui::say(&format!("the episodes end where the data does: {ended}"));
     }
+    if let Some(kept) = &recovered.kept {
+        let kept = crate::io::printable(&kept.display().to_string());
+        ui::say(&format!("what could not be read is kept: {kept}"));
+    }
     let (k, n) = (recovered.episodes, recovered.planned);
     match n.checked_sub(k) {
         _ if n == 0 => ui::say("lost: unknown, since nobody noted how many episodes were planned"),
-        Some(lost @ 1..) => ui::say(&format!("lost: {lost} of {n} planned episodes; they had not been committed")),
+        Some(lost @ 1..) => ui::say(&format!(
+            "lost: {lost} of {n} planned episodes{}",
+            if recovered.ended.is_some() { "" } else { "; they had not been committed" }
+        )),
         _ => {}
     }
     if k == 0 {

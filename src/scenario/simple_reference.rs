@@ -153,7 +153,9 @@ impl Scenario for SimpleReference {
 
     fn reward_convention(&self) -> &'static str {
         match self.params.reward {
-            Reward::Overlap => "20 per step with both agents at their goals, 10 with one, summed over the two agents",
+            Reward::Overlap => {
+                "both_reward (10 unless set) per agent and step with both at their goals, one_reward (5) with one, summed"
+            }
             Reward::Distance => "sum over agents of the mix (local_ratio) of −distance of the other and the mean",
         }
     }

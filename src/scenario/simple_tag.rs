@@ -229,7 +229,7 @@ impl Scenario for SimpleTag {
     fn reward_convention(&self) -> &'static str {
         match self.params.team_reward {
             TeamReward::Once => {
-                "10 per predator-prey contact and step, summed over predators, counted once for the team"
+                "contact_reward (10 unless set) per predator-prey contact and step, summed over predators, counted once"
             }
             TeamReward::Sum => "sum over agents: the contacts once per predator, and the prey's own reward",
         }

@@ -272,9 +272,8 @@ fn start_partial(path: &Path, force: bool) -> Result<PathBuf, StorageError> {
 }
 
 /// Whether ccmarl made what stands at `path`: an empty directory or file, one with a rollout manifest, or a file that
-/// carries one of our metadata keys in its last mebibyte.
+/// carries one.
 fn is_ours(path: &Path) -> Result<bool, IoError> {
-    use std::io::{Read as _, Seek as _, SeekFrom};
     if path.is_dir() {
         if std::fs::read_dir(path).map_err(IoError::os("list", path))?.next().is_none() {
             return Ok(true);
@@ -283,13 +282,19 @@ fn is_ours(path: &Path) -> Result<bool, IoError> {
         let json: serde_json::Value = serde_json::from_str(&manifest).unwrap_or_default();
         return Ok(json["kind"] == "rollouts");
     }
+    let size = path.metadata().map_err(IoError::os("read", path))?.len();
+    Ok(size == 0 || carries(path, "ccmarl.manifest")?)
+}
+
+/// Whether a file has this metadata key in its last mebibyte.
+fn carries(path: &Path, key: &str) -> Result<bool, IoError> {
+    use std::io::{Read as _, Seek as _, SeekFrom};
     let mut file = std::fs::File::open(path).map_err(IoError::os("open", path))?;
     let size = file.metadata().map_err(IoError::os("read", path))?.len();
     let mut tail = Vec::new();
     file.seek(SeekFrom::Start(size.saturating_sub(1 << 20))).map_err(IoError::os("read", path))?;
     file.take(1 << 20).read_to_end(&mut tail).map_err(IoError::os("read", path))?;
-    let holds = |key: &str| tail.windows(key.len()).any(|w| w == key.as_bytes());
-    Ok(size == 0 || holds("ccmarl.manifest") || holds(PAIRS_KEY))
+    Ok(tail.windows(key.len()).any(|w| w == key.as_bytes()))
 }
 
 /// The first format that claims the path; Parquet when none does.

@@ -18,6 +18,8 @@ pub struct Recovered {
     pub planned: u64,
     /// Why the episodes end where they end, unless they ended in good order.
     pub ended: Option<String>,
+    /// Where the leftover is kept that could not be read to its end.
+    pub kept: Option<PathBuf>,
 }
 
 impl Recovered {
@@ -94,17 +96,25 @@ pub fn recover(
     let format = format_of(&target).build;
     if leftover != target
         && target.exists()
+        && only_locked(&leftover)
         && let (Ok(store), Err(StorageError::NotAStore { .. })) = (super::open(&target), (format.salvage)(&leftover))
     {
         // the kill came when the store had its name, before the empty rest was removed
         io::remove(&leftover)?;
         let episodes = store.manifest().episodes;
-        return Ok(Recovered { path: target, episodes, planned: store.manifest().planned.max(episodes), ended: None });
+        return Ok(Recovered {
+            path: target,
+            episodes,
+            planned: store.manifest().planned.max(episodes),
+            ended: None,
+            kept: None,
+        });
     }
     io::refuse_existing(&target, force)?;
     let mut source = (format.salvage)(&leftover)?;
     let manifest = source.manifest().clone();
-    let mut recovered = Recovered { path: target.clone(), episodes: 0, planned: manifest.planned, ended: None };
+    let mut recovered =
+        Recovered { path: target.clone(), episodes: 0, planned: manifest.planned, ended: None, kept: None };
     // Built under a name of its own, with the ending of the target, which chooses the format.
     let mut name = std::ffi::OsString::from(".recovered.");
     name.push(target.file_name().unwrap_or("out".as_ref()));
@@ -130,8 +140,20 @@ pub fn recover(
     }
     sink.finish()?;
     io::publish(&built, &target, force, "manifest.json")?;
-    if leftover != target {
+    if recovered.ended.is_some() && leftover != target {
+        // what cannot be read now may hold more: it stays, where nothing takes it for a recording
+        let mut names = (1..=u32::MAX).map(|k| leftover.with_extension(format!("unrecovered-{k}")));
+        let kept = names.find(|name| name.symlink_metadata().is_err()).unwrap_or_else(|| leftover.clone());
+        std::fs::rename(&leftover, &kept).map_err(IoError::os("keep", &kept))?;
+        recovered.kept = Some(kept);
+    } else if leftover != target {
         io::remove(&leftover)?;
     }
     Ok(recovered)
+}
+
+/// Whether nothing but a lock is left: no part, no journal.
+fn only_locked(leftover: &Path) -> bool {
+    let entries = std::fs::read_dir(leftover).into_iter().flatten();
+    leftover.is_dir() && entries.flatten().all(|entry| entry.file_name() == "lock")
 }

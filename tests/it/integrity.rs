@@ -565,3 +565,15 @@ fn a_row_too_wide_for_any_reader_is_refused() {
     let error = wide.check().unwrap_err().to_string();
     assert!(error.contains("a row of") && error.contains("over the limit of 50331648"), "{error}");
 }
+
+#[test]
+fn a_leftover_with_data_beside_a_whole_store_is_not_removed() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = directory.path().join("m");
+    let golden = Path::new(env!("CARGO_MANIFEST_DIR")).join("datasets/golden/v1/store.parquet");
+    convert(&golden, &store, false).unwrap();
+    let part = directory.path().join(".m.partial/part-00001.parquet");
+    ccmarl::io::write_atomic(&part, b"episodes of another recording").unwrap();
+    assert!(recover(&store, false).is_err());
+    assert!(part.exists());
+}

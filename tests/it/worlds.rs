@@ -154,7 +154,7 @@ fn golden() -> Vec<std::path::PathBuf> {
 #[test]
 fn profile_mpe2_equals_mpe2() {
     let stores = golden();
-    assert_eq!(stores.len(), 28);
+    assert_eq!(stores.len(), 36);
     for path in stores {
         let mut source = ccmarl::storage::open(&path).unwrap();
         assert!(source.manifest().steps >= 50);

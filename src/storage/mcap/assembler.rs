@@ -109,6 +109,9 @@ impl Assembler {
             let (other, steps) = (end.index, end.steps);
             return Err(format!("episode {index} of {rows} rows: its end says episode {other} of {steps} steps"));
         }
+        if self.episode.reward.len() + 1 != rows {
+            return Err(format!("episode {index} of {rows} rows: its last row has no is_last"));
+        }
         let mut episode = self.start(index + 1);
         episode.steps = rows - 1;
         let hash = check(&self.layout, &episode, index).map_err(|e| format!("episode {index}: {e}"))?;
@@ -131,6 +134,9 @@ fn add(layout: &Layout, e: &mut Episode, rows: &mut usize, row: proto::Step) -> 
         return Err(format!("expected episode {} step {r}, found episode {episode} step {step}", e.index));
     }
     let place = || format!("episode {} step {r}", e.index);
+    if e.reward.len() != r {
+        return Err(format!("{}: a row follows the one with is_last", place()));
+    }
     if row.is_first != (r == 0) || (row.is_terminal && !row.is_last) {
         return Err(format!("{}: is_first, is_last, is_terminal do not fit", place()));
     }
@@ -164,4 +170,26 @@ fn add(layout: &Layout, e: &mut Episode, rows: &mut usize, row: proto::Step) -> 
     e.terminal = row.is_terminal;
     *rows += 1;
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nothing_follows_the_last_row() {
+        let layout = Layout { agents: Vec::new(), state_fields: Vec::new() };
+        let (mut e, mut rows) = (Episode::with_capacity(&layout, 0, 2), 0);
+        let row = |step: u32, last: bool| proto::Step {
+            step,
+            is_first: step == 0,
+            is_last: last,
+            reward: (!last).then_some(1.0),
+            ..proto::Step::default()
+        };
+        add(&layout, &mut e, &mut rows, row(0, false)).unwrap();
+        add(&layout, &mut e, &mut rows, row(1, true)).unwrap();
+        let error = add(&layout, &mut e, &mut rows, row(2, false)).unwrap_err();
+        assert_eq!(error, "episode 0 step 2: a row follows the one with is_last");
+    }
 }

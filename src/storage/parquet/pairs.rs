@@ -21,7 +21,7 @@ use super::columns::{ELEMENT, properties};
 use super::encoder::refused;
 use crate::io::{self, IoError};
 use crate::schema::{Episode, Layout, Manifest, Matrix};
-use crate::storage::{PAIRS_KEY, StorageError, is_ours};
+use crate::storage::{PAIRS_KEY, StorageError, carries};
 
 /// Rows that are encoded at once.
 const BLOCK_ROWS: usize = 8192;
@@ -67,7 +67,7 @@ impl PairsWriter {
         let json = Manifest { parts: Vec::new(), ..manifest.clone() }.sealed_json();
         let json = json.map_err(|source| StorageError::Schema { source, path: path.to_owned() })?;
         io::refuse_existing(path, force)?;
-        if path.symlink_metadata().is_ok() && (path.is_dir() || !is_ours(path)?) {
+        if path.symlink_metadata().is_ok() && (path.is_dir() || !carries(path, PAIRS_KEY)?) {
             return Err(IoError::Foreign(path.to_owned()).into());
         }
         io::create_parent(path)?;
