@@ -144,7 +144,7 @@ impl Summary {
     }
 }
 
-/// Runs the command. Memory is one episode and one number per episode.
+/// Runs the command. Memory is what the reader holds and one number per episode.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let whole = if let Some(store) = &args.store {
         if let Some(out) = &args.out {

@@ -3,13 +3,11 @@
 use std::path::PathBuf;
 
 use serde::Serialize;
-use serde_json::Value;
 
 use super::{Outcome, ui};
 use crate::Error;
-use crate::record::{Difference, FLOAT_TOLERANCE, Resimulation};
-use crate::registry::Spec;
-use crate::scenario::{self, Scenario};
+use crate::record::{Difference, FLOAT_TOLERANCE, Resimulation, scenario_of};
+use crate::scenario::Scenario;
 use crate::schema::{Episode, Manifest};
 use crate::storage::{self, Problem, Report};
 
@@ -57,14 +55,14 @@ struct Printed<'a> {
     resimulation: Option<&'a [Difference]>,
 }
 
-/// Runs the command. Memory is one episode.
+/// Runs the command. Memory is what the reader holds: some batches of rows, or one episode.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let bar = ui::progress(0, "verifying");
     let (mut scenario, mut again) = (None, None);
     let mut watch = |manifest: &Manifest, episode: &Episode| {
         bar.set_length(manifest.episodes.max(manifest.planned));
         bar.inc(1);
-        let wrong = rewards(scenario.get_or_insert_with(|| scenario_of(manifest)).as_deref(), episode);
+        let wrong = rewards(scenario.get_or_insert_with(|| scenario_of(manifest).ok()).as_deref(), episode);
         let wrong = wrong.map(|message| ("rewards", message));
         if !args.resimulate {
             return wrong;
@@ -100,13 +98,6 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     };
     print(args, &report, verdict, differences.as_deref())?;
     Ok(outcome)
-}
-
-/// The scenario that the manifest names, if this program has it.
-fn scenario_of(manifest: &Manifest) -> Option<Box<dyn Scenario>> {
-    let Value::Object(_) = &manifest.scenario else { return None };
-    let spec: Spec = serde_json::from_value(manifest.scenario.clone()).ok()?;
-    scenario::build(&spec).ok()
 }
 
 /// Compares the team reward of each step with the agents' rewards; another program may have rounded them otherwise.

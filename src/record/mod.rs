@@ -9,7 +9,7 @@ mod scripted;
 
 use serde_json::{Map, Value};
 
-pub use resimulate::{Difference, FLOAT_TOLERANCE, Resimulation, STATE_TOLERANCE};
+pub use resimulate::{Difference, FLOAT_TOLERANCE, Resimulation, STATE_TOLERANCE, scenario_of};
 pub use rollout::{EpisodeReturn, Options, Recorded, Recording, loss_rate, returns};
 pub use run::{ActionNoise, Trained};
 

@@ -37,10 +37,20 @@ impl Difference {
             let (found, expected): (f64, f64) = (found.into(), expected.into());
             let difference = (found - expected).abs() / expected.abs().max(1.0);
             if difference.is_nan() || difference > self.largest {
-                *self = Self { largest: difference, episode, step, column: std::mem::take(&mut self.column), ..*self };
+                (self.largest, self.episode, self.step) = (difference, episode, step);
             }
         }
     }
+}
+
+/// Builds the scenario that a store's manifest names.
+///
+/// # Errors
+/// [`RecordError::Scenario`] when it cannot be built, [`RecordError::Mismatch`] when it names none.
+pub fn scenario_of(manifest: &Manifest) -> Result<Box<dyn Scenario>, RecordError> {
+    let named = manifest.scenario.clone();
+    let spec: Spec = serde_json::from_value(named).map_err(|e| RecordError::Mismatch(format!("scenario: {e}")))?;
+    Ok(crate::scenario::build(&spec)?)
 }
 
 /// Compares the columns of a store with those of its scenario; messages may be of any width.
@@ -96,9 +106,7 @@ impl Resimulation {
     /// # Errors
     /// [`RecordError::Scenario`] when it cannot be built, [`RecordError::Mismatch`] when its columns are others.
     pub fn of(manifest: &Manifest) -> Result<Self, RecordError> {
-        let named = manifest.scenario.clone();
-        let spec: Spec = serde_json::from_value(named).map_err(|e| RecordError::Mismatch(format!("scenario: {e}")))?;
-        let (scenario, layout) = (crate::scenario::build(&spec)?, manifest.layout());
+        let (scenario, layout) = (scenario_of(manifest)?, manifest.layout());
         check_layout(&*scenario, &layout)?;
         let column = |column: String, tolerance| Difference { column, largest: 0.0, tolerance, episode: 0, step: 0 };
         let named =
@@ -129,7 +137,7 @@ impl Resimulation {
         let at = |step: usize, message: &str| format!("episode {} step {step}: {message}", e.index);
         let mut seen = vec![0.0; self.observation_offsets[e.observations.len()]];
         let mut rewards = vec![0.0; e.rewards.len()];
-        let mut actions = Vec::new();
+        let (mut actions, mut next) = (Vec::new(), Vec::new());
         for (step, recorded) in e.state.chunks_exact(width.max(1)).enumerate() {
             scenario.check_state(recorded).map_err(|m| RecordError::Mismatch(at(step, &m)))?;
             scenario.observe(recorded, &mut seen);
@@ -147,7 +155,8 @@ impl Resimulation {
                 checked.map_err(|m| RecordError::Mismatch(at(step, &format!("action.{}: {m}", agent.name))))?;
                 actions.extend_from_slice(taken);
             }
-            let mut next = recorded.to_vec();
+            next.clear();
+            next.extend_from_slice(recorded);
             scenario.step(&mut next, &actions, &mut rewards, &mut self.scratch);
             self.state.compare(e.index, step + 1, &e.state[(step + 1) * width..(step + 2) * width], &next);
             self.reward.compare(e.index, step, &e.reward[step..=step], &[scenario.team_reward(&rewards)]);

@@ -152,21 +152,21 @@ pub trait Scenario: Send + Sync {
     /// # Errors
     /// One line that names the field and what is allowed.
     fn check_state(&self, state: &[f64]) -> Result<(), String> {
-        let (shape, fields) = (self.shape(), self.state_fields());
-        if state.len() != fields.len() {
-            return Err(format!("state must have {} elements, found {}", fields.len(), state.len()));
+        let shape = self.shape();
+        if state.len() != shape.width() {
+            return Err(format!("state must have {} elements, found {}", shape.width(), state.len()));
         }
-        if let Some((field, value)) = fields.iter().zip(state).find(|(_, v)| !v.is_finite()) {
-            return Err(format!("state field {field} must be finite, found {value}"));
+        let fail = |at: usize, must: &str| {
+            Err(format!("state field {} must be {must}, found {}", self.state_fields()[at], state[at]))
+        };
+        if let Some(at) = state.iter().position(|v| !v.is_finite()) {
+            return fail(at, "finite");
         }
-        let goals = if shape.goals { shape.agents } else { 0 };
-        for (field, &goal) in fields.iter().zip(state).skip(fields.len() - goals) {
-            if goal.fract() != 0.0 || !(0.0..shape.landmarks as f64).contains(&goal) {
-                let last = shape.landmarks - 1;
-                return Err(format!("state field {field} must be a landmark's number in [0, {last}], found {goal}"));
-            }
+        let lands = |goal: f64| goal.fract() == 0.0 && (0.0..shape.landmarks as f64).contains(&goal);
+        match shape.goals_at().find(|&at| !lands(state[at])) {
+            Some(at) => fail(at, &format!("a landmark's number in [0, {}]", shape.landmarks - 1)),
+            None => Ok(()),
         }
-        Ok(())
     }
 }
 

@@ -77,7 +77,9 @@ impl Common {
             return Err(spec.invalid(format!("steps must be in [1, 10000], found {}", self.steps)));
         }
         if self.discrete && self.decoder == Decoder::Force2 {
-            return Err(spec.invalid("discrete actions are moves of decoder mpe5 or mpe2, found force2"));
+            return Err(
+                spec.invalid("discrete actions are moves of decoder mpe5 or mpe2, found force2: set decoder=mpe5")
+            );
         }
         spec.in_range("dt", self.dt, 1e-4, 1.0)?;
         spec.in_range("damping", self.damping, 0.0, 1.0)?;

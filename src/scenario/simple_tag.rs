@@ -15,7 +15,7 @@
 //! Observation of a predator `10 + 2N` (16 at N = 3), world units: own velocity, own position, obstacles relative, other
 //! agents relative (predators, then the prey), velocity of the prey; what is beyond `view_radius` is zeros. The prey
 //! observes the same without the last pair and nothing is hidden from it. Action 2 (`force2`) or 5 (`mpe5`, `mpe2`), the
-//! prey's too. State: `x y vx vy` per agent, `x y` per obstacle (`landmark_k`).
+//! prey's too; when actions are discrete, its rule takes the nearest move. State: `x y vx vy` per agent, `x y` per obstacle (`landmark_k`).
 //!
 //! # Parameters
 //! See [`Params`]; `agents` is N, the number of predators.

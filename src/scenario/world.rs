@@ -67,6 +67,11 @@ impl Shape {
         if body < self.agents { body * self.stride() } else { self.first_landmark() + 2 * (body - self.agents) }
     }
 
+    /// Where the goals lie.
+    pub(super) fn goals_at(self) -> std::ops::Range<usize> {
+        self.first_goal()..self.width()
+    }
+
     /// Puts `body` at a place.
     pub fn place(self, row: &mut [f64], body: usize, position: [f64; 2]) {
         row[self.at(body)..][..2].copy_from_slice(&position);

@@ -32,6 +32,12 @@ pub(super) fn release(directory: &Path) -> Result<(), StorageError> {
     Ok(())
 }
 
+/// Whether nothing but a lock is left in a directory: no part, no journal.
+pub(super) fn is_alone(directory: &Path) -> bool {
+    let entries = std::fs::read_dir(directory);
+    entries.is_ok_and(|mut entries| entries.all(|entry| entry.is_ok_and(|e| e.file_name() == LOCK_FILE)))
+}
+
 /// Locks what a writer left behind; refused while that writer lives.
 pub(super) fn hold_leftover(leftover: &Path) -> Result<Option<File>, StorageError> {
     let path = if leftover.is_dir() { leftover.join(LOCK_FILE) } else { leftover.to_owned() };

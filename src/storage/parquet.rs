@@ -39,11 +39,14 @@ mod sink;
 mod source;
 mod twins;
 
+use std::fs::File;
 use std::path::Path;
 
 pub use pairs::PairsWriter;
+use parquet::file::metadata::{ParquetMetaData, ParquetMetaDataReader};
 
 use super::{EpisodeSink, EpisodeSource, Format, Options, StorageError};
+use crate::io::IoError;
 use crate::registry::Entry;
 use crate::schema::Manifest;
 
@@ -95,6 +98,18 @@ pub(super) fn check_table(path: &Path) -> Result<(), StorageError> {
 
 fn salvage(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
     Ok(Box::new(salvage::Leftover::open(path)?))
+}
+
+/// The footer of a file.
+fn footer(path: &Path) -> Result<ParquetMetaData, StorageError> {
+    let file = File::open(path).map_err(IoError::os("open", path))?;
+    decoder::guard(path, || ParquetMetaDataReader::new().parse_and_finish(&file))
+}
+
+/// What a footer says under a key.
+fn entry<'a>(metadata: &'a ParquetMetaData, key: &str) -> Option<&'a str> {
+    let mut entries = metadata.file_metadata().key_value_metadata().into_iter().flatten();
+    entries.find(|kv| kv.key == key).and_then(|kv| kv.value.as_deref())
 }
 
 /// Where the 64 digits of the file's own digest begin in the end of its footer: after the key stand two bytes of

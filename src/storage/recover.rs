@@ -62,7 +62,8 @@ fn os_str(bytes: &[u8]) -> Option<&OsStr> {
     std::str::from_utf8(bytes).ok().map(OsStr::new)
 }
 
-/// Puts the whole episodes of an unfinished store under its name, and removes what was left. `path` is the name, or
+/// Puts the whole episodes of an unfinished store under its name, and removes what was left; what cannot be read to its
+/// end is kept beside it instead. `path` is the name, or
 /// what is left beside it, or a finished file that was cut short; that one is replaced only with `force`. Memory is
 /// bounded. A kill meanwhile loses nothing: what was left goes last.
 ///
@@ -95,9 +96,8 @@ pub fn recover(
     let _held = lock::hold_leftover(&leftover)?;
     let format = format_of(&target).build;
     if leftover != target
-        && target.exists()
-        && only_locked(&leftover)
-        && let (Ok(store), Err(StorageError::NotAStore { .. })) = (super::open(&target), (format.salvage)(&leftover))
+        && lock::is_alone(&leftover)
+        && let Ok(store) = super::open(&target)
     {
         // the kill came when the store had its name, before the empty rest was removed
         io::remove(&leftover)?;
@@ -150,10 +150,4 @@ pub fn recover(
         io::remove(&leftover)?;
     }
     Ok(recovered)
-}
-
-/// Whether nothing but a lock is left: no part, no journal.
-fn only_locked(leftover: &Path) -> bool {
-    let entries = std::fs::read_dir(leftover).into_iter().flatten();
-    leftover.is_dir() && entries.flatten().all(|entry| entry.file_name() == "lock")
 }

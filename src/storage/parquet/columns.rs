@@ -64,6 +64,14 @@ pub(super) fn row_bytes(layout: &Layout) -> u64 {
     (19 + 8 * layout.state_fields.len() + n * n + agents) as u64
 }
 
+/// Bytes of a batch of rows in memory, about.
+const BATCH_BYTES: u64 = 16 << 20;
+
+/// Rows that are decoded at once.
+pub(super) fn batch_rows(layout: &Layout) -> usize {
+    (BATCH_BYTES / row_bytes(layout)).clamp(1, 8192) as usize
+}
+
 /// Encodings: floats split into byte streams under zstd (measured 20 % under raw, where the crate's defaults are over
 /// raw), keys as deltas, no dictionary. Options go by leaf path, and one on a wrong path is ignored in silence, so the
 /// paths are taken from the schema and a test reads them back from a file.

@@ -11,15 +11,13 @@ use arrow::datatypes::{DataType, Field, Schema};
 use arrow::error::ArrowError;
 use parquet::arrow::arrow_reader::{ArrowReaderMetadata, ArrowReaderOptions};
 
-use super::columns::{row_bytes, schema};
+use super::columns::{batch_rows, schema};
 use super::pages::{PageFault, check_pages};
 use super::side_by_side::SideBySide;
 use crate::io::IoError;
 use crate::schema::{Episode, Layout};
 use crate::storage::StorageError;
 
-/// Bytes of a batch of rows in memory, about.
-const BATCH_BYTES: u64 = 16 << 20;
 /// Largest page of a store, bytes; ccmarl's own are about a mebibyte, or one row.
 const PAGE_LIMIT: u64 = 64 << 20;
 
@@ -46,8 +44,8 @@ impl Decoder {
             PageFault::Unreadable(message) | PageFault::Greedy(message) => damaged(path, message),
         })?;
         let roots = roots(metadata.schema(), layout, path)?;
-        let rows = (BATCH_BYTES / row_bytes(layout)).clamp(1, 8192) as usize;
-        Ok(Self::new(path, layout, Box::new(SideBySide::open(path, &metadata, &roots, rows)?)))
+        let reader = SideBySide::open(path, &metadata, &roots, batch_rows(layout))?;
+        Ok(Self::new(path, layout, Box::new(reader)))
     }
 
     /// Reads the batches of a journal, whose columns are compared with the layout.

@@ -1,13 +1,10 @@
 //! Everything that is wrong with a damaged directory or file, part by part.
 
-use std::fs::File;
 use std::path::Path;
 
-use parquet::file::metadata::ParquetMetaDataReader;
-
-use super::decoder::{Decoder, guard};
+use super::decoder::Decoder;
 use super::source::check_file;
-use super::{MANIFEST_FILE, MANIFEST_KEY};
+use super::{MANIFEST_FILE, MANIFEST_KEY, entry, footer};
 use crate::io::{self, IoError};
 use crate::schema::{Layout, Manifest, Part};
 use crate::storage::verify::Findings;
@@ -48,17 +45,15 @@ fn single(path: &Path, findings: &mut Findings<'_>) -> Result<Option<Manifest>, 
         Err(error @ StorageError::NotAStore { .. }) => return Err(error),
         Err(error) => findings.error("digest", "file", &error),
     }
-    let file = File::open(path).map_err(IoError::os("open", path))?;
-    let metadata = match guard(path, || ParquetMetaDataReader::new().parse_and_finish(&file)) {
+    let metadata = match footer(path) {
         Ok(metadata) => metadata,
+        Err(error @ StorageError::Io(_)) => return Err(error),
         Err(error) => {
             findings.error("footer", "file", &error);
             return Ok(None);
         }
     };
-    let mut entries = metadata.file_metadata().key_value_metadata().into_iter().flatten();
-    let text = entries.find(|kv| kv.key == MANIFEST_KEY).and_then(|kv| kv.value.as_deref());
-    Ok(findings.manifest(MANIFEST_KEY, text))
+    Ok(findings.manifest(MANIFEST_KEY, entry(&metadata, MANIFEST_KEY)))
 }
 
 fn parts(directory: &Path, manifest: &Manifest, total: &mut Tally, findings: &mut Findings<'_>) {

@@ -38,11 +38,16 @@ pub(super) struct Group {
 }
 
 /// A column of the group.
-enum Column {
-    /// Encoded as it comes.
-    Own(ArrowColumnWriter),
-    /// So far the same as another column: its blocks, should that change, and the writer for them.
-    Twin(usize, Vec<ArrayRef>, ArrowColumnWriter),
+struct Column {
+    writer: ArrowColumnWriter,
+    /// While it is the same as another column, nothing is written.
+    twin: Option<Twin>,
+}
+
+/// The other column, and the blocks so far, should one differ.
+struct Twin {
+    of: usize,
+    held: Vec<ArrayRef>,
 }
 
 impl Group {
@@ -61,34 +66,22 @@ impl Group {
     pub(super) fn write(&mut self, batch: &RecordBatch) -> Result<(), ParquetError> {
         if self.columns.is_empty() {
             let writers = self.factory.create_column_writers(0)?.into_iter().zip(&self.twins);
-            let column = |(writer, twin): (_, &Option<usize>)| match twin {
-                Some(of) => Column::Twin(*of, Vec::new(), writer),
-                None => Column::Own(writer),
-            };
+            let column =
+                |(writer, of): (_, &Option<usize>)| Column { writer, twin: of.map(|of| Twin { of, held: Vec::new() }) };
             self.columns = writers.map(column).collect();
         }
         let (fields, blocks) = (self.schema.fields(), batch.columns());
         self.columns.par_iter_mut().zip(fields.par_iter()).zip(blocks).try_for_each(|((column, field), block)| {
-            match column {
-                Column::Own(writer) => write(writer, field, block),
-                Column::Twin(of, held, _) if equal(block, &blocks[*of]) => {
-                    held.push(ArrayRef::clone(block));
-                    Ok(())
-                }
-                Column::Twin(_, held, writer) => {
-                    held.push(ArrayRef::clone(block));
-                    held.drain(..).try_for_each(|block| write(writer, field, &block))
-                }
+            if let Some(twin) = &mut column.twin
+                && equal(block, &blocks[twin.of])
+            {
+                twin.held.push(ArrayRef::clone(block));
+                return Ok(());
             }
-        })?;
-        // a column that has differed once goes on by itself
-        for column in std::mem::take(&mut self.columns) {
-            self.columns.push(match column {
-                Column::Twin(_, held, writer) if held.is_empty() => Column::Own(writer),
-                other => other,
-            });
-        }
-        Ok(())
+            // a column that has differed once goes on by itself
+            let held = column.twin.take().map(|twin| twin.held).unwrap_or_default();
+            held.iter().chain([block]).try_for_each(|block| write(&mut column.writer, field, block))
+        })
     }
 
     /// Ends the group; `None` when it has no rows.
@@ -96,9 +89,9 @@ impl Group {
         if self.columns.is_empty() {
             return Ok(None);
         }
-        let close = |column| match column {
-            Column::Own(writer) => writer.close().map(Ok),
-            Column::Twin(of, ..) => Ok(Err(of)),
+        let close = |column: Column| match column.twin {
+            None => column.writer.close().map(Ok),
+            Some(twin) => Ok(Err(twin.of)),
         };
         let closed: Vec<Result<ArrowColumnChunk, usize>> =
             std::mem::take(&mut self.columns).into_par_iter().map(close).collect::<Result<_, ParquetError>>()?;

@@ -6,12 +6,11 @@ use std::path::{Path, PathBuf};
 
 use arrow::ipc::reader::StreamReader;
 use arrow::ipc::root_as_message;
-use parquet::file::metadata::ParquetMetaDataReader;
 
 use super::decoder::{Decoder, guard};
 use super::journal::journal_name;
 use super::sink::part_name;
-use super::{MANIFEST_FILE, MANIFEST_KEY, PART_KEY};
+use super::{MANIFEST_FILE, MANIFEST_KEY, PART_KEY, entry, footer};
 use crate::io::{self, IoError};
 use crate::schema::{Episode, Layout, Manifest};
 use crate::storage::{EpisodeSource, MANIFEST_LIMIT, StorageError, Tally};
@@ -89,10 +88,8 @@ fn manifest_text(directory: &Path) -> Result<Option<String>, StorageError> {
     }
     let part = directory.join(part_name(0));
     if part.is_file() {
-        let file = File::open(&part).map_err(IoError::os("open", &part))?;
-        let metadata = guard(&part, || ParquetMetaDataReader::new().parse_and_finish(&file))?;
-        let mut entries = metadata.file_metadata().key_value_metadata().into_iter().flatten();
-        return Ok(entries.find(|kv| kv.key == PART_KEY || kv.key == MANIFEST_KEY).and_then(|kv| kv.value.clone()));
+        let metadata = footer(&part)?;
+        return Ok(entry(&metadata, PART_KEY).or_else(|| entry(&metadata, MANIFEST_KEY)).map(str::to_owned));
     }
     let journal = directory.join(journal_name(0));
     if !journal.is_file() {

@@ -9,15 +9,13 @@ use std::thread::JoinHandle;
 use parquet::file::metadata::ParquetMetaDataReader;
 use sha2::{Digest as _, Sha256};
 
+use super::columns::batch_rows;
 use super::decoder::{Decoder, guard};
 use super::pages::{PageFault, check_pages};
-use super::{FILE_SHA256_KEY, MANIFEST_FILE, MANIFEST_KEY, PART_KEY, find_file_digest};
+use super::{FILE_SHA256_KEY, MANIFEST_FILE, MANIFEST_KEY, PART_KEY, entry, find_file_digest, footer};
 use crate::io::{self, IoError};
 use crate::schema::{Episode, Layout, Manifest, Part, SELF_SHA256_PLACEHOLDER, SchemaError, hex};
 use crate::storage::{EpisodeSource, MANIFEST_LIMIT, StorageError, Tally};
-
-/// Rows that are decoded and checked ahead, unless one episode has more.
-const AHEAD_ROWS: usize = 8192;
 
 /// An episode, and its content hash or what is wrong with it.
 type Checked = (Episode, Result<[u8; 32], SchemaError>);
@@ -27,21 +25,24 @@ type FileDigest = JoinHandle<Result<(String, u64), IoError>>;
 /// Reads some episodes ahead, so that they are checked side by side.
 struct Ahead {
     decoder: Decoder,
+    /// Rows that are decoded and checked ahead, unless one episode has more.
+    rows: usize,
     ready: VecDeque<Checked>,
     /// What came after the episodes that are ready.
     fault: Option<StorageError>,
 }
 
 impl Ahead {
-    fn new(decoder: Decoder) -> Self {
-        Self { decoder, ready: VecDeque::new(), fault: None }
+    fn open(path: &Path, layout: &Layout) -> Result<Self, StorageError> {
+        let decoder = Decoder::open(path, layout)?;
+        Ok(Self { decoder, rows: batch_rows(layout), ready: VecDeque::new(), fault: None })
     }
 
     /// The next episode of the store of which `total` was read, and its content hash; `None` at the end of the file.
     fn next(&mut self, total: &Tally, layout: &Layout) -> Result<Option<Checked>, StorageError> {
         if self.ready.is_empty() && self.fault.is_none() {
             let (mut episodes, mut rows) = (Vec::new(), 0);
-            while rows < AHEAD_ROWS && self.fault.is_none() {
+            while rows < self.rows && self.fault.is_none() {
                 match self.decoder.next_episode(total.episodes + episodes.len() as u64) {
                     Ok(Some(episode)) => {
                         rows += episode.rows();
@@ -69,7 +70,7 @@ pub(super) struct Parts {
     next_part: usize,
     /// The open part, and what was read of it.
     current: Option<(Ahead, Tally)>,
-    /// The digest of the next part, in the making.
+    /// The digest of a part to come, in the making, and that part's number.
     digest: Option<(usize, FileDigest)>,
     total: Tally,
 }
@@ -122,8 +123,12 @@ impl Parts {
             return Ok(false);
         };
         let path = self.directory.join(&part.file);
-        check_part(&path, part)?;
-        self.current = Some((Ahead::new(Decoder::open(&path, &self.layout)?), Tally::default()));
+        let begun = self.digest.take().filter(|(number, _)| *number == self.next_part);
+        check_part(&path, part, || {
+            let made = begun.and_then(|(_, thread)| thread.join().ok());
+            made.unwrap_or_else(|| io::sha256_file(&path))
+        })?;
+        self.current = Some((Ahead::open(&path, &self.layout)?, Tally::default()));
         self.next_part += 1;
         self.digest = self.manifest.parts.get(self.next_part).map(|next| {
             let path = self.directory.join(&next.file);
@@ -190,12 +195,9 @@ impl Single {
     /// Checks the digest of the whole file, then reads its manifest.
     pub(super) fn open(path: &Path) -> Result<Self, StorageError> {
         check_file(path)?;
-        let file = File::open(path).map_err(IoError::os("open", path))?;
         let damaged = |message: String| StorageError::Damaged { message, path: path.to_owned() };
-        let metadata = ParquetMetaDataReader::new().parse_and_finish(&file);
-        let metadata = metadata.map_err(|e| damaged(format!("its footer cannot be read: {e}")))?;
-        let entries = metadata.file_metadata().key_value_metadata();
-        let text = entries.into_iter().flatten().find(|kv| kv.key == MANIFEST_KEY).and_then(|kv| kv.value.as_deref());
+        let metadata = footer(path)?;
+        let text = entry(&metadata, MANIFEST_KEY);
         let manifest = parse(text.ok_or_else(|| damaged(format!("it has no {MANIFEST_KEY}")))?, path)?;
         let layout = manifest.layout();
         let rows = u64::try_from(metadata.file_metadata().num_rows()).unwrap_or(0);
@@ -203,7 +205,7 @@ impl Single {
             let (episodes, steps) = (manifest.episodes, manifest.steps);
             return Err(damaged(format!("{episodes} episodes of {steps} steps do not give its {rows} rows")));
         }
-        let decoder = Some(Ahead::new(Decoder::open(path, &layout)?));
+        let decoder = Some(Ahead::open(path, &layout)?);
         Ok(Self { path: path.to_owned(), manifest, layout, decoder, total: Tally::default() })
     }
 }
@@ -310,13 +312,17 @@ fn check_part_of(path: &Path) -> Result<(), StorageError> {
     let Ok(manifest) = Manifest::parse(&text) else { return Ok(()) };
     let name = path.file_name().unwrap_or_default();
     match manifest.parts.iter().find(|part| *part.file == *name) {
-        Some(part) => check_part(path, part),
+        Some(part) => check_part(path, part, || io::sha256_file(path)),
         None => Ok(()),
     }
 }
 
-/// Compares a part with its length and digest in the manifest.
-fn check_part(path: &Path, part: &Part) -> Result<(), StorageError> {
+/// Compares a part with its length and digest in the manifest; `digest` is asked only when it is long enough.
+fn check_part(
+    path: &Path,
+    part: &Part,
+    digest: impl FnOnce() -> Result<(String, u64), IoError>,
+) -> Result<(), StorageError> {
     let size = std::fs::metadata(path).map_err(IoError::os("read", path))?.len();
     let (expected, [from, to]) = (part.bytes, part.episodes);
     let damaged = |what: String| {
@@ -326,7 +332,7 @@ fn check_part(path: &Path, part: &Part) -> Result<(), StorageError> {
     if size < expected {
         return Err(damaged(format!("cut short, {size} of {expected} bytes")));
     }
-    let (sha256, bytes) = io::sha256_file(path)?;
+    let (sha256, bytes) = digest()?;
     if sha256 != part.sha256 || bytes != expected {
         return Err(damaged("the bytes changed since it was written".to_owned()));
     }
