@@ -4,17 +4,23 @@ use clap::Args as ClapArgs;
 use clap::builder::PossibleValuesParser;
 use serde::Serialize;
 
+use serde_json::{Map, Value, json};
+
 use super::Outcome;
 use super::ui::{self, Format};
 use crate::link;
-use crate::registry::Entry;
+use crate::registry::{self, Entry, RegistryError, Spec};
+use crate::scenario;
+
+/// The profiles of every scenario.
+const PROFILES: [&str; 2] = ["paper", "mpe2"];
 
 /// Lists the entries of a kind.
 type List = fn(&'static str) -> Vec<Listed>;
 
 /// The registries: a kind's name and its entries. A new registry is one line here.
 const KINDS: &[(&str, List)] = &[
-    ("scenario", |kind| listed(kind, crate::scenario::SCENARIOS)),
+    ("scenario", |kind| listed(kind, scenario::SCENARIOS)),
     ("link", |kind| listed(kind, link::LINKS)),
     ("policy", |kind| listed(kind, crate::record::POLICIES)),
     ("format", |kind| listed(kind, crate::storage::FORMATS)),
@@ -42,6 +48,9 @@ pub(super) struct Args {
     /// Only plugins of this kind
     #[arg(value_name = "KIND", value_parser = PossibleValuesParser::new(KINDS.iter().map(|(kind, _)| *kind)))]
     kind: Option<String>,
+    /// Only this one; a scenario shows its parameters and their defaults, for --set
+    #[arg(requires = "kind")]
+    name: Option<String>,
     /// How to print the list
     #[arg(long, value_enum, default_value_t)]
     format: Format,
@@ -52,6 +61,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let wanted = |kind: &str| args.kind.as_deref().is_none_or(|k| k == kind);
     let mut all: Vec<Listed> = KINDS.iter().filter(|(k, _)| wanted(k)).flat_map(|(kind, list)| list(kind)).collect();
     all.sort_by_key(|plugin| (plugin.kind, plugin.name));
+    if let (Some(kind), Some(name)) = (&args.kind, &args.name) {
+        return one(&all, kind, name, args.format);
+    }
     match args.format {
         Format::Json => ui::print_json(&all)?,
         Format::Table => {
@@ -60,6 +72,50 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         }
     }
     Ok(Outcome::Done)
+}
+
+/// Prints one plugin of a kind, with the parameters of a scenario in both profiles.
+fn one(all: &[Listed], kind: &str, name: &str, format: Format) -> anyhow::Result<Outcome> {
+    let Some(plugin) = all.iter().find(|plugin| plugin.name == name) else {
+        let hint = registry::did_you_mean(name, all.iter().map(|plugin| plugin.name));
+        let kind = all.first().map_or("plugin", |plugin| plugin.kind);
+        return Err(crate::Error::from(RegistryError::Unknown { kind, name: name.to_owned(), hint }).into());
+    };
+    let parameters = if kind == "scenario" { parameters(name)? } else { Map::new() };
+    if format == Format::Json {
+        ui::print_json(&json!({ "plugin": plugin, "parameters": parameters }))?;
+        return Ok(Outcome::Done);
+    }
+    ui::print(&format!("{kind} {}: {}\nreference: {}", plugin.syntax, plugin.summary, plugin.reference))?;
+    if !parameters.is_empty() {
+        let [first, second] = PROFILES;
+        let cell = |value: &Value, profile: &str| text(&value[profile]);
+        let rows = parameters.iter().map(|(key, value)| vec![key.clone(), cell(value, first), cell(value, second)]);
+        ui::print("\ndefaults, each changed by --set key=value:\n")?;
+        ui::print_table(&["key", "profile paper", "profile mpe2"], &rows.collect::<Vec<_>>())?;
+    }
+    Ok(Outcome::Done)
+}
+
+/// The parameters of a scenario: key → profile → default.
+fn parameters(name: &str) -> anyhow::Result<Map<String, Value>> {
+    let mut table: Map<String, Value> = Map::new();
+    for profile in PROFILES {
+        let scenario = scenario::build(&Spec::new(name).with("profile", profile)).map_err(crate::Error::from)?;
+        for (key, value) in scenario.parameters().into_iter().filter(|(key, _)| key != "name" && key != "profile") {
+            table.entry(key).or_insert_with(|| json!({}))[profile] = value;
+        }
+    }
+    Ok(table)
+}
+
+/// A value as `--set` takes it.
+fn text(value: &Value) -> String {
+    match value {
+        Value::String(text) => text.clone(),
+        Value::Null => "none".to_owned(),
+        other => other.to_string(),
+    }
 }
 
 /// The entries of one registry.
@@ -96,6 +152,14 @@ fn tested(kind: &'static str, name: &'static str, summary: String) -> Listed {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_scenarios_parameters_show_both_profiles_as_set_takes_them() {
+        let table = parameters("simple_tag").unwrap();
+        assert_eq!(text(&table["view_radius"]["paper"]), "0.25");
+        assert_eq!(text(&table["view_radius"]["mpe2"]), "none");
+        assert!(table.values().all(|defaults| PROFILES.iter().all(|p| !defaults[p].is_null())), "{table:?}");
+    }
 
     #[test]
     fn an_entry_shows_how_it_is_written() {

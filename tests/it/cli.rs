@@ -36,6 +36,7 @@ fn usage_faults_exit_2_and_name_the_nearest() {
         (&["lisst"][..], "'list'"),
         (&["list", "scenaro"], "'scenario'"),
         (&["list", "--fromat", "json"], "'--format'"),
+        (&["list", "scenario", "simple_tga"], "unknown scenario \"simple_tga\": did you mean simple_tag"),
         (&[], "Usage: ccmarl <COMMAND>"),
     ] {
         let (code, out, err) = run(args);
