@@ -9,7 +9,7 @@ use super::StorageError;
 use crate::io::IoError;
 
 /// Name of the lock within a directory that is being written; it holds the writer's process number.
-const LOCK_FILE: &str = "lock";
+pub(super) const LOCK_FILE: &str = "lock";
 
 /// Locks the directory in which this process writes a store.
 pub(super) fn hold_directory(directory: &Path) -> Result<File, StorageError> {
@@ -25,7 +25,7 @@ pub(super) fn hold_file(file: &File, path: &Path) -> Result<(), StorageError> {
     take(file, path, None)
 }
 
-/// Removes the lock of a directory that is whole.
+/// Removes the lock file of a store that has its name.
 pub(super) fn release(directory: &Path) -> Result<(), StorageError> {
     let path = directory.join(LOCK_FILE);
     std::fs::remove_file(&path).map_err(IoError::os("remove", &path))?;
@@ -41,7 +41,9 @@ pub(super) fn is_alone(directory: &Path) -> bool {
 /// Locks what a writer left behind; refused while that writer lives.
 pub(super) fn hold_leftover(leftover: &Path) -> Result<Option<File>, StorageError> {
     let path = if leftover.is_dir() { leftover.join(LOCK_FILE) } else { leftover.to_owned() };
-    let Ok(mut file) = File::open(&path) else { return Ok(None) };
+    // to write, since network file systems give such locks only to who may write
+    let opened = File::options().read(true).write(true).open(&path).or_else(|_| File::open(&path));
+    let Ok(mut file) = opened else { return Ok(None) };
     let mut owner = String::new();
     if leftover.is_dir() {
         (&mut file).take(20).read_to_string(&mut owner).ok();

@@ -31,6 +31,7 @@ mod diagnose;
 mod encoder;
 mod group;
 mod journal;
+mod journal_reader;
 mod pages;
 mod pairs;
 mod salvage;
@@ -65,7 +66,7 @@ pub(super) const ENTRY: Entry<Format> = Entry {
     summary: "a directory of Parquet parts with a manifest, or one .parquet file",
     reference: "Apache Parquet",
     value: None,
-    build: Format { claims, create, open, salvage, diagnose: diagnose::diagnose },
+    build: Format { claims, create, open, salvage, diagnose: diagnose::diagnose, viewer: |_| true },
 };
 
 fn claims(path: &Path) -> bool {

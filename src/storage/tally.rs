@@ -63,6 +63,7 @@ impl Tally {
         manifest.episodes = self.episodes;
         manifest.steps = self.steps;
         manifest.content = self.content();
+        manifest.task.clear();
         if manifest.planned <= self.episodes {
             manifest.planned = 0; // all there
         }

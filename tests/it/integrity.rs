@@ -22,11 +22,12 @@ fn verify(path: &Path) -> Report {
 }
 
 fn recover(path: &Path, force: bool) -> Result<Recovered, StorageError> {
-    storage::recover(path, force, &mut |_, _| {})
+    storage::recover(path, force, &mut |_, _| {}, &AtomicBool::new(false)).map(Option::unwrap)
 }
 
 fn convert(from: &Path, to: &Path, force: bool) -> Result<Option<Manifest>, StorageError> {
-    storage::convert(from, to, force, &mut |_, _| {}, &AtomicBool::new(false))
+    let options = storage::Options { force, viewer: true };
+    storage::convert(from, to, options, &mut |_, _| {}, &AtomicBool::new(false))
 }
 
 /// (check, place, lost) of every problem.
@@ -371,7 +372,8 @@ fn a_conversion_that_fails_or_is_stopped_leaves_nothing() {
         let path = directory.path().join("source.mcap");
         write(&path, &layout, &some(&layout, 5), false).unwrap();
         let to = directory.path().join(form);
-        let stopped = storage::convert(&path, &to, false, &mut |_, _| {}, &AtomicBool::new(true)).unwrap();
+        let options = storage::Options { force: false, viewer: true };
+        let stopped = storage::convert(&path, &to, options, &mut |_, _| {}, &AtomicBool::new(true)).unwrap();
         assert!(stopped.is_none());
         let mut bytes = fs::read(&path).unwrap();
         let middle = bytes.len() / 2;
