@@ -5,7 +5,7 @@ use std::sync::atomic::Ordering;
 
 use serde_json::json;
 
-use super::args::stop_flag;
+use super::args::{end_on_signals, stop_flag};
 use super::{Outcome, ui};
 use crate::Error;
 use crate::pairs::PairsError;
@@ -40,12 +40,13 @@ pub(super) struct Args {
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     crate::io::refuse_existing(&args.out, args.force).map_err(Error::from)?;
     storage::refuse_within_store(&args.out).map_err(Error::from)?;
-    let stop = stop_flag()?;
+    end_on_signals()?; // until there is something to clean up
     let mut source = storage::open(&args.store).map_err(Error::from)?;
     let layout = source.manifest().layout();
     if layout.links().is_empty() {
         return Err(Error::from(PairsError::NoLinks { found: layout.communicators().len() }).into());
     }
+    let stop = stop_flag()?;
     let mut table = PairsWriter::create(&args.out, source.manifest(), args.force).map_err(Error::from)?;
     let bar = ui::progress(source.manifest().episodes, "episodes");
     while let Some(episode) = source.next_episode().map_err(Error::from)? {

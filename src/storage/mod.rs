@@ -207,7 +207,16 @@ pub enum StorageError {
         /// The output.
         path: PathBuf,
     },
-    /// There is nothing to recover.
+    /// A store has its name: nothing was left unfinished.
+    #[error(
+        "nothing to recover: it is no unfinished recording; where `ccmarl verify` finds damage, `ccmarl recover {} --out NEW` saves what is sound: {}",
+        printable(path), path.display()
+    )]
+    Finished {
+        /// Where.
+        path: PathBuf,
+    },
+    /// Nothing is damaged.
     #[error("nothing to recover: it is whole; `ccmarl verify` checks it, `ccmarl convert` copies it: {}", path.display())]
     Whole {
         /// Where.
@@ -264,7 +273,7 @@ pub fn create_with(path: &Path, manifest: &Manifest, options: Options) -> Result
 /// [`StorageError`] when it is missing, not a store, of a newer version, or damaged.
 pub fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
     if let Some((path, target)) = recover::unfinished(path) {
-        lock::hold_leftover(&path)?;
+        lock::refuse_living(&path)?;
         return Err(names::unfinished(&target, path));
     }
     if !path.exists() {

@@ -102,7 +102,7 @@ pub(super) fn refuse_foreign(path: &Path) -> Result<(), IoError> {
     let foreign = || Err(IoError::Foreign(path.to_owned()));
     if !path.is_dir() {
         let size = path.metadata().map_err(IoError::os("read", path))?.len();
-        let ours = size == 0 || (carries(path, "ccmarl.manifest")? && has_magic(path)?);
+        let ours = size == 0 || begins_as_ours(path)?;
         return if ours { Ok(()) } else { foreign() };
     }
     let mut names = Vec::new();
@@ -136,13 +136,17 @@ pub(super) fn publish(from: &Path, to: &Path, force: bool) -> Result<(), IoError
     io::publish(from, to, force, MANIFEST_FILE)
 }
 
-/// Whether a file begins as Parquet or MCAP do.
-fn has_magic(path: &Path) -> Result<bool, IoError> {
+/// Whether a file begins as Parquet does and ends with a manifest, or as our MCAP, which may be cut short.
+fn begins_as_ours(path: &Path) -> Result<bool, IoError> {
     use std::io::Read as _;
-    let mut magic = Vec::new();
+    let mut head = Vec::new();
     let file = std::fs::File::open(path).map_err(IoError::os("open", path))?;
-    file.take(8).read_to_end(&mut magic).map_err(IoError::os("read", path))?;
-    Ok(magic.starts_with(b"PAR1") || magic.starts_with(b"\x89MCAP"))
+    file.take(1 << 12).read_to_end(&mut head).map_err(IoError::os("read", path))?;
+    let recording = head.windows(16).any(|bytes| bytes == b"ccmarl.recording");
+    if head.starts_with(b"\x89MCAP") && recording {
+        return Ok(true);
+    }
+    Ok(head.starts_with(b"PAR1") && carries(path, "ccmarl.manifest")?)
 }
 
 /// Whether a file has this metadata key in its last mebibyte.

@@ -93,7 +93,7 @@ pub fn recover(
                 return Err(StorageError::Damaged { message, path });
             }
             Err(error) => return Err(error),
-            Ok(_) => return Err(StorageError::Whole { path: target }),
+            Ok(_) => return Err(StorageError::Finished { path: target }),
         }
     }
     let _held = lock::hold_leftover(&leftover)?;

@@ -176,7 +176,7 @@ impl<'a> Findings<'a> {
 pub fn verify<'a>(path: &Path, watch: &'a mut Watch<'a>) -> Result<Report, StorageError> {
     let mut findings = Findings::new(watch);
     if let Some((leftover, target)) = recover::unfinished(path) {
-        lock::hold_leftover(&leftover)?; // refused while somebody writes
+        lock::refuse_living(&leftover)?;
         unfinished(&leftover, &target, &mut findings)?;
         return Ok(findings.report);
     }

@@ -303,6 +303,7 @@ fn an_unfinished_recording_keeps_its_committed_episodes_and_is_not_overwritten()
             assert_eq!(rows, episodes[..3].iter().map(Episode::rows).sum::<usize>());
         }
         drop(sink);
+        super::integrity::settle(&path);
         assert!(partial.exists() && !path.exists());
         let error = message(read(&path));
         assert!(error.contains("its recording did not finish; `ccmarl recover"), "{error}");
@@ -389,7 +390,7 @@ fn what_is_no_store_says_what_to_give_instead() {
 }
 
 /// Puts a changed manifest over a directory store, with its digest made right again.
-fn reseal(store: &Path, change: impl Fn(&mut Manifest)) {
+pub(crate) fn reseal(store: &Path, change: impl Fn(&mut Manifest)) {
     let path = store.join("manifest.json");
     let mut manifest = Manifest::parse(&fs::read_to_string(&path).unwrap()).unwrap();
     change(&mut manifest);

@@ -11,11 +11,13 @@ use super::source::{Stop, scan};
 use crate::io::IoError;
 use crate::storage::StorageError;
 
+/// Bytes of a record's opcode and length.
+const RECORD_HEAD: u64 = 9;
 /// How every chunk says how it is compressed, within its head.
 const CHUNK_MARK: &[u8] = b"\x04\0\0\0zstd";
 
 /// Refuses a file whose last whole record is not followed by what a kill leaves: nothing, a piece of one record, or the
-/// closing magic.
+/// closing magic. A bare head of a record counts as no piece for the reader.
 pub(super) fn check_tail(path: &Path) -> Result<(), StorageError> {
     let mut end = MAGIC.len() as u64;
     let options = LinearReaderOptions::default().with_skip_end_magic(true);
@@ -28,7 +30,7 @@ pub(super) fn check_tail(path: &Path) -> Result<(), StorageError> {
     let left = file.metadata().map_err(IoError::os("read", path))?.len().saturating_sub(end);
     file.seek(SeekFrom::Start(end)).map_err(IoError::os("read", path))?;
     // a torn chunk has its own mark
-    let fits = if torn { chunks(file).map_err(IoError::os("read", path))? < 2 } else { left <= MAGIC.len() as u64 };
+    let fits = if torn { chunks(file).map_err(IoError::os("read", path))? < 2 } else { left <= RECORD_HEAD };
     if fits {
         return Ok(());
     }
