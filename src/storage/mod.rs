@@ -241,10 +241,7 @@ pub enum StorageError {
 impl StorageError {
     /// Whether the user's words are at fault, not the data or the machine.
     pub fn is_usage(&self) -> bool {
-        matches!(
-            self,
-            Self::Extension { .. } | Self::Slash { .. } | Self::Within { .. } | Self::Io(IoError::Exists(_))
-        )
+        matches!(self, Self::Extension { .. } | Self::Slash { .. } | Self::Within { .. } | Self::Io(IoError::Exists(_)))
     }
 }
 

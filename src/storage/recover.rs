@@ -4,7 +4,7 @@ use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::{EpisodeSource, Options, StorageError, format_of, lock, publish};
+use super::{EpisodeSource, Options, StorageError, format_of, lock, names, publish};
 use crate::io::{self, IoError};
 use crate::schema::{Episode, Manifest};
 
@@ -109,6 +109,7 @@ pub fn recover(
         return Ok(Some(Recovered { path: target, episodes, planned, ended: None, kept: None }));
     }
     io::refuse_existing(&target, force)?;
+    names::refuse_foreign(&target)?;
     let mut source = (format.salvage)(&leftover)?;
     let manifest = source.manifest().clone();
     let mut recovered =

@@ -206,7 +206,8 @@ fn notes(manifest: &Manifest) -> Vec<String> {
     let mut notes = Vec::new();
     if manifest.planned > 0 && !manifest.content.is_empty() {
         let (episodes, planned) = (manifest.episodes, manifest.planned);
-        let why = if manifest.kept.is_empty() { "the recording was stopped, or cut short" } else { "the others were lost" };
+        let why =
+            if manifest.kept.is_empty() { "the recording was stopped, or cut short" } else { "the others were lost" };
         notes.push(format!("{episodes} of {planned} planned episodes: {why}"));
     }
     if !manifest.kept.is_empty() {

@@ -508,7 +508,10 @@ fn a_record_of_ten_gigabytes_in_a_small_file_is_an_error() {
         bytes[at..at + 8].copy_from_slice(&(10_u64 << 30).to_le_bytes());
         fs::write(&path, bytes).unwrap();
         let error = message(read(&path));
-        assert!(error.starts_with("damaged: ") || error.starts_with("cut short, and no episode of it is whole: "), "{error}");
+        assert!(
+            error.starts_with("damaged: ") || error.starts_with("cut short, and no episode of it is whole: "),
+            "{error}"
+        );
         let report = storage::verify(&path, &mut |_, _| None);
         assert!(!report.is_ok_and(|r| r.is_clean()));
     }

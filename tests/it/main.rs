@@ -7,6 +7,7 @@ mod cli;
 mod estimate_mi;
 mod extracts;
 mod figures;
+mod forged;
 mod fuzz;
 mod integrity;
 mod links;

@@ -84,7 +84,9 @@ fn a_flipped_bit_of_a_leftover_never_becomes_an_episode() {
             }
             flip(&file, bit);
         }
-        println!("{form}: {bits} bits; {whole} leave both episodes as they are, {fewer} look like an end that a kill left");
+        println!(
+            "{form}: {bits} bits; {whole} leave both episodes as they are, {fewer} look like an end that a kill left"
+        );
         // padding and the times of chunks are nobody's data; a torn end is the length of the last message
         assert!(whole < bits * 2 / 3 && fewer < bits / 20, "{form}: {whole} {fewer} of {bits}");
     }
@@ -133,7 +135,8 @@ fn a_damaged_length_is_no_torn_end_and_what_follows_is_kept() {
         let bytes = fs::read(&file).unwrap();
         // the second batch of the journal, or the third chunk
         let at = if form == "store" {
-            let messages: Vec<usize> = (0..bytes.len() - 8).step_by(8).filter(|&at| begins_a_message(&bytes[at..])).collect();
+            let messages: Vec<usize> =
+                (0..bytes.len() - 8).step_by(8).filter(|&at| begins_a_message(&bytes[at..])).collect();
             assert_eq!(messages.len(), 4, "a schema and three batches");
             messages[2] + 7
         } else {
@@ -145,7 +148,10 @@ fn a_damaged_length_is_no_torn_end_and_what_follows_is_kept() {
         assert!(report.is_wrong() && report.episodes == 2, "{form}: {report:?}");
         let (code, _, err) = ccmarl(&["recover", path.to_str().unwrap()]);
         assert_eq!(code, 3, "{err}");
-        assert!(err.contains("what could not be read is kept: ") && err.contains("lost: 4 of 6 planned episodes\n"), "{err}");
+        assert!(
+            err.contains("what could not be read is kept: ") && err.contains("lost: 4 of 6 planned episodes\n"),
+            "{err}"
+        );
         assert!(directory.path().join(format!(".{form}.unrecovered-1")).exists());
         assert_eq!(read(&path).unwrap(), episodes[..2]);
     }
@@ -260,7 +266,9 @@ fn a_killed_conversion_is_called_one() {
         assert!(error.starts_with("its conversion did not finish; `ccmarl recover"), "{error}");
         let report = verify(&copy);
         assert!(report.problems[0].message.starts_with("the conversion did not finish: "), "{report:?}");
-        assert!(report.problems[0].message.ends_with(" puts them in place, and the same command with --force starts anew"));
+        assert!(
+            report.problems[0].message.ends_with(" puts them in place, and the same command with --force starts anew")
+        );
         convert(&source, &copy, true).unwrap().unwrap();
         assert_eq!(read(&copy).unwrap().len(), 5);
         // the finished store does not say how it was made
@@ -279,7 +287,10 @@ fn a_cut_mcap_file_names_the_remedy_and_is_no_stopped_recording() {
     let name = path.to_str().unwrap();
     let (code, out, _) = ccmarl(&["verify", name, "--format", "json"]);
     assert_eq!(code, 3);
-    assert!(out.contains("cut short: copy it again, or keep its whole episodes with `ccmarl recover --force`"), "{out}");
+    assert!(
+        out.contains("cut short: copy it again, or keep its whole episodes with `ccmarl recover --force`"),
+        "{out}"
+    );
     assert!(!out.contains("the recording was stopped"), "{out}");
     let error = message(read(&path));
     let remedy = format!("whole episodes: copy it again, or keep these with `ccmarl recover --force {name}`");
@@ -311,7 +322,12 @@ fn a_directory_with_one_bad_part_gives_its_other_episodes() {
     let before = fs::read(&part).unwrap();
     let report = verify(&path);
     assert_eq!(report.episodes, 4500, "none of the bad part's are taken for sound");
-    assert!(report.problems.iter().any(|p| p.message.contains("episodes 4000 to 7999 are in it, and do not have their digest")));
+    assert!(
+        report
+            .problems
+            .iter()
+            .any(|p| p.message.contains("episodes 4000 to 7999 are in it, and do not have their digest"))
+    );
     let (_, out, _) = ccmarl(&["verify", path.to_str().unwrap(), "--format", "json"]);
     assert!(out.contains("\"content\": null"), "the manifest's digest is not that of 4500 episodes: {out}");
     let (_, _, hint) = ccmarl(&["recover", path.to_str().unwrap()]);
@@ -323,7 +339,10 @@ fn a_directory_with_one_bad_part_gives_its_other_episodes() {
     assert_eq!((source.manifest().kept.clone(), source.manifest().planned), (vec![[0, 4000], [8000, 8500]], 8500));
     let (code, out, _) = ccmarl(&["verify", saved.to_str().unwrap()]);
     assert_eq!(code, 0);
-    assert!(out.contains("saved from a damaged store, where its episodes were numbered 0 to 3999, 8000 to 8499"), "{out}");
+    assert!(
+        out.contains("saved from a damaged store, where its episodes were numbered 0 to 3999, 8000 to 8499"),
+        "{out}"
+    );
     assert!(fs::read(&part).unwrap() == before, "the damaged store is only read");
 }
 
@@ -366,7 +385,9 @@ fn one_file_gives_all_or_nothing() {
     assert_eq!(verify(&path).episodes, 0);
     let (code, err) = rescue(&path, &saved);
     assert_eq!((code, saved.exists()), (3, false), "{err}");
-    assert!(err.contains("lost: 40 of 40 episodes: 0 to 39") && err.contains("no episode is sound: nothing was written"));
+    assert!(
+        err.contains("lost: 40 of 40 episodes: 0 to 39") && err.contains("no episode is sound: nothing was written")
+    );
     // in the name of the program that wrote it nothing is lost
     let name = good.windows(10).rposition(|w| w == b"parquet-rs").unwrap();
     fs::write(&path, &good).unwrap();

@@ -32,7 +32,10 @@ fn every_error_says_what_is_wrong_what_to_do_and_where() {
         std::process::id()
     )));
     let texts: [(String, &str); 30] = [
-        (IoError::os("open", &path())(OsError::other("no such device")).to_string(), "could not open: no such device: data/x"),
+        (
+            IoError::os("open", &path())(OsError::other("no such device")).to_string(),
+            "could not open: no such device: data/x",
+        ),
         (IoError::Exists(path()).to_string(), "output exists: give --force to replace it, or another --out: data/x"),
         (IoError::Missing(path()).to_string(), "no such file or directory: data/x"),
         (
@@ -97,10 +100,7 @@ fn every_error_says_what_is_wrong_what_to_do_and_where() {
             StorageError::Empty { path: path() }.to_string(),
             "killed before its first episode was committed: there is nothing to recover; start again with --force: data/x",
         ),
-        (
-            StorageError::Damaged { message: "a bit".to_owned(), path: path() }.to_string(),
-            "damaged: a bit: data/x",
-        ),
+        (StorageError::Damaged { message: "a bit".to_owned(), path: path() }.to_string(), "damaged: a bit: data/x"),
         (RecordError::NoEpisodes.to_string(), "expected at least 1 episode, found 0: give --episodes"),
         (
             RecordError::Threads { threads: 9, reason: "no memory".to_owned() }.to_string(),
@@ -144,7 +144,9 @@ fn force_keeps_what_somebody_else_put_into_a_store() {
     let store = directory.path().join("store");
     write(&store, &layout, &some(&layout, 2), false).unwrap();
     let before = read(&store).unwrap();
-    for (name, is_file) in [("thesis.tex", true), ("part-copy.parquet", true), ("part-00000.parquet.bak", true), ("figures", false)] {
+    for (name, is_file) in
+        [("thesis.tex", true), ("part-copy.parquet", true), ("part-00000.parquet.bak", true), ("figures", false)]
+    {
         let foreign = store.join(name);
         if is_file {
             fs::write(&foreign, "years of work").unwrap();
@@ -152,7 +154,9 @@ fn force_keeps_what_somebody_else_put_into_a_store() {
             fs::create_dir(&foreign).unwrap();
         }
         let words = ["record", "--scenario", "simple_spread", "--episodes", "2", "--force", "--out"];
-        for (command, source) in [(&words[..], None), (&["convert", "--force"], Some(golden_folder().join("store.mcap")))] {
+        for (command, source) in
+            [(&words[..], None), (&["convert", "--force"], Some(golden_folder().join("store.mcap")))]
+        {
             let mut words: Vec<String> = command.iter().map(|&word| word.to_owned()).collect();
             words.extend(source.iter().chain([&store]).map(|path| path.to_str().unwrap().to_owned()));
             let (code, out, err) = ccmarl(&words.iter().map(String::as_str).collect::<Vec<_>>());
@@ -185,7 +189,12 @@ fn an_estimate_replaces_only_estimates() {
             let (code, _, err) = estimate(&out);
             assert_eq!(code, 0, "its own result, and an empty file: {err}");
         }
-        for foreign in [fs::read(golden_folder().join("store/manifest.json")).unwrap(), b"a,b\n1,2\n".to_vec(), b"[{\"estimator\": 1}]".to_vec(), fs::read(golden_folder().join("store.parquet")).unwrap()] {
+        for foreign in [
+            fs::read(golden_folder().join("store/manifest.json")).unwrap(),
+            b"a,b\n1,2\n".to_vec(),
+            b"[{\"estimator\": 1}]".to_vec(),
+            fs::read(golden_folder().join("store.parquet")).unwrap(),
+        ] {
             fs::write(&out, &foreign).unwrap();
             let (code, stdout, err) = estimate(&out);
             assert_eq!((code, stdout.as_str()), (1, ""), "{form}");
@@ -260,7 +269,13 @@ fn a_glob_over_stores_is_no_store() {
     let before = (bytes("a.parquet"), bytes("b.parquet"));
     // as a shell writes *.parquet out: two stores where a command takes one
     let glob = [at("a.parquet"), at("b.parquet")].map(|path| path.to_str().unwrap().to_owned());
-    for (words, code) in [(vec!["verify"], 2), (vec!["inspect"], 2), (vec!["recover"], 2), (vec!["convert"], 2), (vec!["convert", "--force"], 1)] {
+    for (words, code) in [
+        (vec!["verify"], 2),
+        (vec!["inspect"], 2),
+        (vec!["recover"], 2),
+        (vec!["convert"], 2),
+        (vec!["convert", "--force"], 1),
+    ] {
         let all = words.iter().copied().chain(glob.iter().map(String::as_str)).collect::<Vec<_>>();
         if words.last() == Some(&"--force") {
             continue; // that asks for it: b.parquet is a store of ours

@@ -172,7 +172,8 @@ impl Part {
         if part.kind != KIND {
             return Err(format!("expected kind {KIND:?}, found {:?}", part.kind));
         }
-        let zeroed = text.strip_suffix(&format!("{}\"}}", part.part_sha256)).map(|text| text.to_owned() + &zeros() + "\"}");
+        let zeroed =
+            text.strip_suffix(&format!("{}\"}}", part.part_sha256)).map(|text| text.to_owned() + &zeros() + "\"}");
         if zeroed.is_none_or(|zeroed| hex(&Sha256::digest(zeroed.as_bytes())) != part.part_sha256) {
             return Err("part_sha256 does not match its text: the part was changed or damaged".to_owned());
         }

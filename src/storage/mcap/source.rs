@@ -133,7 +133,14 @@ impl McapSource {
     ) -> Result<Self, StorageError> {
         let records = Records::open(path, options.with_prevalidate_chunk_crcs(true))?;
         let assembler = Assembler::new(manifest.layout());
-        Ok(Self { path: path.to_owned(), manifest, records: Some(records), assembler, total: Tally::default(), leftover })
+        Ok(Self {
+            path: path.to_owned(),
+            manifest,
+            records: Some(records),
+            assembler,
+            total: Tally::default(),
+            leftover,
+        })
     }
 }
 

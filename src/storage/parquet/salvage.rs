@@ -72,7 +72,8 @@ impl Leftover {
                 checked => checked,
             };
         };
-        let (mut decoder, mut tally, mut next) = (Decoder::open(path, &self.layout)?, Tally::default(), part.episodes[0]);
+        let (mut decoder, mut tally, mut next) =
+            (Decoder::open(path, &self.layout)?, Tally::default(), part.episodes[0]);
         while let Some(episode) = decoder.next_episode(next)? {
             let hash = check(&self.layout, &episode, next);
             tally.add(&episode, &hash.map_err(|source| StorageError::Schema { source, path: path.to_owned() })?);
