@@ -64,6 +64,7 @@ pub(super) fn end_on_signals() -> anyhow::Result<()> {
 }
 
 fn handle_signals() -> anyhow::Result<()> {
+    #[expect(clippy::exit, reason = "the handler's thread cannot return to the command's")]
     let handler = || {
         STOP.store(true, Ordering::SeqCst);
         if !ENDS_ITSELF.load(Ordering::SeqCst) {

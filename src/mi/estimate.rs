@@ -4,7 +4,9 @@ use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::Path;
 
-use polars::prelude::{Column, CsvWriter, DataFrame, ParquetReader, ParquetWriter, SerReader as _, SerWriter as _};
+use polars::prelude::{
+    Column, CsvWriter, DataFrame, ParquetReader, ParquetWriter, PlSmallStr, SerReader as _, SerWriter as _,
+};
 use serde::Serialize;
 
 use crate::io;
@@ -156,7 +158,7 @@ pub fn to_csv(rows: &[Estimate]) -> Result<Vec<u8>, String> {
 /// Whether a file holds such rows and nothing else, by its ending and its columns; an empty file is nobody's.
 pub fn is_estimates(path: &Path) -> bool {
     let keys: Vec<String> = match frame(&[]) {
-        Ok(frame) => frame.get_column_names().iter().map(|name| name.to_string()).collect(),
+        Ok(frame) => frame.get_column_names().iter().map(ToString::to_string).collect(),
         Err(_) => return false,
     };
     let Ok(file) = File::open(path) else { return false };
@@ -176,7 +178,7 @@ pub fn is_estimates(path: &Path) -> bool {
         }
         Some("parquet") => {
             let schema = io::caught(|| ParquetReader::new(file).schema());
-            schema.is_some_and(|schema| schema.is_ok_and(|s| s.iter_names().map(|name| name.as_str()).eq(keys.iter())))
+            schema.is_some_and(|schema| schema.is_ok_and(|s| s.iter_names().map(PlSmallStr::as_str).eq(keys.iter())))
         }
         _ => false,
     }

@@ -15,14 +15,14 @@ pub(super) const LOCK_FILE: &str = "lock";
 pub(super) fn hold_directory(directory: &Path) -> Result<File, StorageError> {
     let path = directory.join(LOCK_FILE);
     let mut file = File::create_new(&path).map_err(IoError::os("create", &path))?;
-    refuse_locked(file.try_lock(), directory, None)?;
+    refuse_locked(&file.try_lock(), directory, None)?;
     write!(file, "{}", std::process::id()).map_err(IoError::os("write", &path))?;
     Ok(file)
 }
 
 /// Locks the file in which this process writes a store.
 pub(super) fn hold_file(file: &File, path: &Path) -> Result<(), StorageError> {
-    refuse_locked(file.try_lock(), path, None)
+    refuse_locked(&file.try_lock(), path, None)
 }
 
 /// Removes the lock file of a store that has its name.
@@ -56,11 +56,11 @@ fn ask(leftover: &Path, lock: fn(&File) -> Result<(), TryLockError>) -> Result<O
     if leftover.is_dir() {
         (&mut file).take(20).read_to_string(&mut owner).ok();
     }
-    refuse_locked(lock(&file), leftover, owner.parse().ok())?;
+    refuse_locked(&lock(&file), leftover, owner.parse().ok())?;
     Ok(Some(file))
 }
 
-fn refuse_locked(taken: Result<(), TryLockError>, path: &Path, owner: Option<u32>) -> Result<(), StorageError> {
+fn refuse_locked(taken: &Result<(), TryLockError>, path: &Path, owner: Option<u32>) -> Result<(), StorageError> {
     match taken {
         Err(TryLockError::WouldBlock) => Err(StorageError::Busy { owner: Owner(owner), path: PathBuf::from(path) }),
         // Some network file systems have no locks: there, two writers are told of each other by the name alone.

@@ -16,7 +16,7 @@ use mcap::records::{MessageHeader, Metadata};
 use parquet::file::metadata::{ColumnChunkMetaData, ParquetMetaDataReader};
 
 use super::integrity::{killed, verify};
-use super::stores::{data_file, episode, layout, manifest, message, read, reseal, small, some, write};
+use super::stores::{data_file, episode, layout, message, read, reseal, small, some, write};
 
 /// Writes an MCAP store again, with other options and without some records.
 fn rewritten(
@@ -28,7 +28,9 @@ fn rewritten(
 ) -> Vec<u8> {
     let mut writer = options.disable_seeking(true).create(Cursor::new(Vec::new())).unwrap();
     if manifests {
-        metadata(bytes).iter().for_each(|record| writer.write_metadata(record).unwrap());
+        for record in metadata(bytes) {
+            writer.write_metadata(&record).unwrap();
+        }
     }
     let mut channels = BTreeMap::new();
     for (count, message) in mcap::MessageStream::new(bytes).unwrap().enumerate() {

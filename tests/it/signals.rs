@@ -18,11 +18,11 @@ fn end(child: Child, signal: &str) -> (Option<i32>, String) {
     (output.status.code(), String::from_utf8(output.stderr).unwrap())
 }
 
-/// Waits until the program is asleep in a system call that waits for the writer of a pipe.
+/// Waits for something that a program does.
 fn wait_until(what: &str, done: impl Fn() -> bool) {
     let start = Instant::now();
     while !done() {
-        assert!(start.elapsed() < Duration::from_secs(60), "waited in vain for: {what}");
+        assert!(start.elapsed() < Duration::from_mins(1), "waited in vain for: {what}");
         std::thread::sleep(Duration::from_millis(5));
     }
 }

@@ -150,13 +150,13 @@ pub(super) struct Part {
     pub(super) manifest: Manifest,
     pub(super) counts: Counts,
     /// SHA-256 of this text with these digits written as zeros.
-    part_sha256: String,
+    self_sha256: String,
 }
 
 impl Part {
     /// The shard's counts, ready to be written.
     pub(super) fn new(store: String, [shard, shards]: [u64; 2], manifest: Manifest, counts: Counts) -> Self {
-        Self { kind: KIND.to_owned(), store, shard, shards, manifest, counts, part_sha256: zeros() }
+        Self { kind: KIND.to_owned(), store, shard, shards, manifest, counts, self_sha256: zeros() }
     }
 
     /// The text of its file, with its digest at the end.
@@ -173,9 +173,9 @@ impl Part {
             return Err(format!("expected kind {KIND:?}, found {:?}", part.kind));
         }
         let zeroed =
-            text.strip_suffix(&format!("{}\"}}", part.part_sha256)).map(|text| text.to_owned() + &zeros() + "\"}");
-        if zeroed.is_none_or(|zeroed| hex(&Sha256::digest(zeroed.as_bytes())) != part.part_sha256) {
-            return Err("part_sha256 does not match its text: the part was changed or damaged".to_owned());
+            text.strip_suffix(&format!("{}\"}}", part.self_sha256)).map(|text| text.to_owned() + &zeros() + "\"}");
+        if zeroed.is_none_or(|zeroed| hex(&Sha256::digest(zeroed.as_bytes())) != part.self_sha256) {
+            return Err("self_sha256 does not match its text: the part was changed or damaged".to_owned());
         }
         part.manifest.layout().check().map_err(|e| e.to_string())?;
         let (name, all) = (format!("shard {}/{}", part.shard, part.shards), part.manifest.episodes);

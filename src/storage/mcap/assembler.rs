@@ -196,6 +196,8 @@ mod tests {
     #[test]
     fn every_fault_of_a_row_and_of_an_end_is_named() {
         use crate::schema::{AgentSpec, Controller};
+        type ChangeRow = fn(&mut proto::Step);
+        type ChangeEnd = fn(&mut proto::Episode);
         let agent = AgentSpec {
             name: "a".to_owned(),
             team: "t".to_owned(),
@@ -225,7 +227,7 @@ mod tests {
             }
         };
         // what happens to the second of three rows
-        let rows: [(fn(&mut proto::Step), &str); 8] = [
+        let rows: [(ChangeRow, &str); 8] = [
             (|r| r.episode = 1, "expected episode 0 step 1, found episode 1 step 1"),
             (|r| r.step = 5, "expected episode 0 step 1, found episode 0 step 5"),
             (|r| r.is_first = true, "episode 0 step 1: is_first, is_last, is_terminal do not fit"),
@@ -242,7 +244,7 @@ mod tests {
             change(&mut second);
             assert_eq!(add(&layout, &mut e, &mut count, second).unwrap_err(), expected);
         }
-        let ends: [(fn(&mut proto::Episode), &str); 5] = [
+        let ends: [(ChangeEnd, &str); 5] = [
             (|e| e.index = 3, "episode 0 of 2 rows: its end says episode 3 of 1 steps"),
             (|e| e.steps = 9, "episode 0 of 2 rows: its end says episode 0 of 9 steps"),
             (|e| e.terminal = true, "episode 0 of 2 rows: its end says episode 0 of 1 steps"),

@@ -79,7 +79,9 @@ fn parts(directory: &Path, manifest: &Manifest, total: &mut Tally, findings: &mu
         if sound && findings.trusted().is_none() {
             // the manifest beside it is damaged, but the part has a copy
             let copy = footer(&path).ok().and_then(|metadata| Manifest::parse(entry(&metadata, PART_KEY)?).ok());
-            copy.iter().for_each(|copy| findings.trust(copy));
+            if let Some(copy) = copy {
+                findings.trust(&copy);
+            }
         }
         let count = tally.episodes - total.episodes;
         if before == findings.len() && path.is_file() && Some(count) != to.checked_sub(from) {
