@@ -55,16 +55,9 @@ impl Error {
             Self::Usage(_)
             | Self::Record(RecordError::NoEpisodes)
             | Self::Report(ReportError::NoInput)
-            | Self::Storage(StorageError::Extension { .. })
-            | Self::Train(
-                TrainError::Config { .. }
-                | TrainError::Value { .. }
-                | TrainError::Storage(StorageError::Extension { .. }),
-            ) => true,
-            Self::Io(e)
-            | Self::Report(ReportError::Io(e))
-            | Self::Storage(StorageError::Io(e))
-            | Self::Train(TrainError::Io(e) | TrainError::Storage(StorageError::Io(e))) => exists(e),
+            | Self::Train(TrainError::Config { .. } | TrainError::Value { .. }) => true,
+            Self::Storage(error) | Self::Train(TrainError::Storage(error)) => error.is_usage(),
+            Self::Io(e) | Self::Report(ReportError::Io(e)) | Self::Train(TrainError::Io(e)) => exists(e),
             _ => false,
         }
     }

@@ -34,6 +34,17 @@ pub enum IoError {
     /// `--force` would replace something that this program did not make.
     #[error("refusing to replace what ccmarl did not make; remove it by hand, or give another --out: {}", .0.display())]
     Foreign(PathBuf),
+    /// `--force` would remove something that this program did not put there.
+    #[error(
+        "refusing to replace a directory that holds what ccmarl did not put there: {}; move it, or give another --out: {}",
+        printable(&entry.display().to_string()), path.display()
+    )]
+    ForeignEntry {
+        /// The first such name in the directory.
+        entry: PathBuf,
+        /// The directory.
+        path: PathBuf,
+    },
 }
 
 impl IoError {

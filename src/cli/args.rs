@@ -45,11 +45,35 @@ impl ScenarioArgs {
     }
 }
 
+/// Raised by SIGINT and SIGTERM.
+static STOP: AtomicBool = AtomicBool::new(false);
+/// Whether a command ends by itself when [`STOP`] is raised.
+static ENDS_ITSELF: AtomicBool = AtomicBool::new(false);
+
 /// A flag that SIGINT and SIGTERM raise, so that a command can end in good order (exit code 4). One per process.
 pub(super) fn stop_flag() -> anyhow::Result<&'static AtomicBool> {
-    static STOP: AtomicBool = AtomicBool::new(false);
-    match ctrlc::set_handler(|| STOP.store(true, Ordering::Relaxed)) {
-        Ok(()) | Err(ctrlc::Error::MultipleHandlers) => Ok(&STOP),
+    ENDS_ITSELF.store(true, Ordering::SeqCst);
+    handle_signals()?;
+    Ok(&STOP)
+}
+
+/// Lets SIGINT and SIGTERM end the process with exit code 4, for commands whose outputs appear whole at their end; a
+/// command around this one that has a [`stop_flag`] goes before.
+pub(super) fn end_on_signals() -> anyhow::Result<()> {
+    handle_signals()
+}
+
+fn handle_signals() -> anyhow::Result<()> {
+    #[expect(clippy::exit, reason = "the handler's thread cannot return to the command's")]
+    let handler = || {
+        STOP.store(true, Ordering::SeqCst);
+        if !ENDS_ITSELF.load(Ordering::SeqCst) {
+            super::ui::say("interrupted: nothing was written");
+            std::process::exit(4);
+        }
+    };
+    match ctrlc::set_handler(handler) {
+        Ok(()) | Err(ctrlc::Error::MultipleHandlers) => Ok(()),
         Err(error) => Err(error.into()),
     }
 }

@@ -11,8 +11,10 @@ const EXAMPLES: &str = "\
 Examples:
   ccmarl convert data/tag data/tag.mcap
   ccmarl convert data/probe.mcap data/probe.parquet
+  ccmarl convert data/tag data/small.mcap --no-viewer
 
-The content digest is the same in every form. Interrupted, it leaves nothing behind.";
+The content digest is the same in every form. An .mcap made from an .mcap has what viewers draw if that one has it.
+Interrupted (exit code 4), it leaves nothing behind.";
 
 /// Arguments of `convert`.
 #[derive(Debug, clap::Args)]
@@ -25,6 +27,9 @@ pub(super) struct Args {
     /// Replace the store if it exists
     #[arg(long)]
     force: bool,
+    /// Leave out what viewers draw (topics /scene and /poses of an .mcap)
+    #[arg(long)]
+    no_viewer: bool,
 }
 
 /// Runs the command. Memory is one part's buffers.
@@ -34,7 +39,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         bar.set_length(manifest.episodes);
         bar.inc(1);
     };
-    let written = storage::convert(&args.from, &args.to, args.force, &mut watch, stop_flag()?);
+    let options = storage::Options { force: args.force, viewer: !args.no_viewer };
+    let written = storage::convert(&args.from, &args.to, options, &mut watch, stop_flag()?);
     bar.finish_and_clear();
     let Some(manifest) = written.map_err(Error::from)? else {
         ui::say("interrupted: nothing was written");

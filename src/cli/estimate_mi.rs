@@ -7,6 +7,7 @@ use anyhow::Context as _;
 use clap::ValueHint;
 
 use super::Outcome;
+use super::args::end_on_signals;
 use super::ui::{self, Format};
 use crate::Error;
 use crate::mi::{self, ESTIMATORS, Estimate, Job, JobResult, Kind, Plan, Protocol, Unit};
@@ -90,6 +91,7 @@ type Failure = (Job, mi::MiError);
 type Write = fn(&[Estimate]) -> Result<Vec<u8>, String>;
 
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    end_on_signals()?;
     let plan = plan(args)?;
     let write = args.out.as_deref().map(|path| writer(path, &args.path, args.force)).transpose()?;
     let samples = samples(args)?;
@@ -135,13 +137,18 @@ fn writer(path: &Path, input: &Path, force: bool) -> anyhow::Result<Write> {
         return Err(Error::Usage(message).into());
     }
     io::refuse_existing(path, force).map_err(Error::from)?;
+    storage::refuse_within_store(path).map_err(Error::from)?;
     let forms: [(&str, Write); 3] = [("json", mi::to_json), ("csv", mi::to_csv), ("parquet", mi::to_parquet)];
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
     let form = forms.iter().find(|(name, _)| extension.as_deref() == Some(*name));
     let usage = || {
         Error::Usage(format!("--out: expected a name that ends in .json, .csv or .parquet, found {}", path.display()))
     };
-    Ok(form.map(|(_, write)| *write).ok_or_else(usage)?)
+    let write = form.map(|(_, write)| *write).ok_or_else(usage)?;
+    if path.symlink_metadata().is_ok() && !mi::is_estimates(path) {
+        return Err(Error::from(io::IoError::Foreign(path.to_owned())).into());
+    }
+    Ok(write)
 }
 
 fn samples(args: &Args) -> Result<Vec<Samples>, Error> {

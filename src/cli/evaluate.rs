@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use serde_json::json;
 
+use super::args::end_on_signals;
 use super::{Outcome, ui};
 use crate::Error;
 use crate::algo::Actors;
@@ -40,6 +41,7 @@ pub(super) struct Args {
 
 /// Runs the command.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    end_on_signals()?;
     let file = args.run.join("config.toml");
     if args.run.exists() && !file.exists() {
         let message = "not a run directory (it holds no config.toml); give what `ccmarl train --out` wrote";

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 use serde_json::Value;
 
+use super::args::end_on_signals;
 use super::{Outcome, ui};
 use crate::Error;
 use crate::io::{IoError, read_text, refuse_existing, write_atomic};
@@ -146,9 +147,11 @@ impl Summary {
 
 /// Runs the command. Memory is what the reader holds and one number per episode.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    end_on_signals()?;
     let whole = if let Some(store) = &args.store {
         if let Some(out) = &args.out {
             refuse_existing(out, args.force).map_err(Error::from)?;
+            storage::refuse_within_store(out).map_err(Error::from)?;
             if out.exists() && !read_text(out, PART_LIMIT).is_ok_and(|text| Part::parse(&text).is_ok()) {
                 return Err(Error::from(IoError::Foreign(out.clone())).into());
             }
@@ -156,7 +159,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         let shard = args.shard.unwrap_or([0, 1]);
         let part = count(store, shard).map_err(Error::from)?;
         if let Some(out) = &args.out {
-            write_atomic(out, serde_json::to_string(&part)?.as_bytes()).map_err(Error::from)?;
+            write_atomic(out, part.sealed()?.as_bytes()).map_err(Error::from)?;
             let [from, to] = episodes(shard, part.manifest.episodes);
             ui::say(&format!("wrote the counts of episodes {from} to {to} (not included): {}", out.display()));
             return Ok(Outcome::Done);

@@ -5,7 +5,7 @@ use std::sync::atomic::Ordering;
 
 use serde_json::json;
 
-use super::args::stop_flag;
+use super::args::{end_on_signals, stop_flag};
 use super::{Outcome, ui};
 use crate::Error;
 use crate::pairs::PairsError;
@@ -39,6 +39,8 @@ pub(super) struct Args {
 /// Runs the command.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     crate::io::refuse_existing(&args.out, args.force).map_err(Error::from)?;
+    storage::refuse_within_store(&args.out).map_err(Error::from)?;
+    end_on_signals()?; // until there is something to clean up
     let mut source = storage::open(&args.store).map_err(Error::from)?;
     let layout = source.manifest().layout();
     if layout.links().is_empty() {

@@ -1,10 +1,12 @@
 //! `ccmarl quickstart`: the whole line once, as the commands that a user would type.
 
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use clap::Parser as _;
 
+use super::args::stop_flag;
 use super::{Cli, Command, Outcome, dispatch, report, ui};
 use crate::io;
 
@@ -60,8 +62,9 @@ fn commands(dir: &str) -> Vec<Vec<String>> {
 /// Runs the command.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let started = Instant::now();
+    let stop = stop_flag()?; // before any command in it, so that none ends the process
     prepare(&args.out, args.force)?;
-    let made = make(&args.out);
+    let made = make(&args.out, stop);
     // half a quick start is of no use, and cannot go on
     if !matches!(made, Ok(Outcome::Done | Outcome::DataLost)) {
         std::fs::remove_dir_all(&args.out).map_err(io::IoError::os("remove the unfinished", &args.out))?;
@@ -85,7 +88,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
 }
 
 /// Runs the commands, then moves the page to the top of the directory.
-fn make(out: &Path) -> anyhow::Result<Outcome> {
+fn make(out: &Path, stop: &AtomicBool) -> anyhow::Result<Outcome> {
     let dir = out.to_string_lossy().into_owned();
     for words in commands(&dir) {
         ui::say(&format!("\n$ ccmarl {}", words.join(" ")));
@@ -97,6 +100,9 @@ fn make(out: &Path) -> anyhow::Result<Outcome> {
         };
         if outcome != Outcome::Done {
             return Ok(outcome);
+        }
+        if stop.load(Ordering::Relaxed) {
+            return Ok(Outcome::Interrupted);
         }
     }
     // the page belongs at the top of the directory, beside the runs and stores it was made from

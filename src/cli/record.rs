@@ -48,8 +48,8 @@ pub(super) struct Args {
     #[arg(long)]
     out: PathBuf,
     /// Threads; 0 is one per core. Does not change the result
-    #[arg(long, default_value_t = 0)]
-    threads: usize,
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u16).range(0..=1024))]
+    threads: u16,
     /// Replace the store if it exists
     #[arg(long)]
     force: bool,
@@ -106,7 +106,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
             bar.suspend(|| ui::say(&format!("committed {} episodes", episode.index + 1)));
         }
     };
-    let options = Options { threads: args.threads, block: 0 };
+    let options = Options { threads: args.threads.into(), block: 0 };
     let recorded = recording.record(&mut *sink, options, &mut committed, stop).map_err(Error::from)?;
     bar.finish_and_clear();
     if recorded.episodes == 0 {

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
+use super::args::end_on_signals;
 use super::{Outcome, ui};
 use crate::Error;
 use crate::record::{Difference, FLOAT_TOLERANCE, Resimulation, scenario_of};
@@ -57,6 +58,7 @@ struct Printed<'a> {
 
 /// Runs the command. Memory is what the reader holds: some batches of rows, or one episode.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    end_on_signals()?;
     let bar = ui::progress(0, "verifying");
     let (mut scenario, mut again) = (None, None);
     let mut watch = |manifest: &Manifest, episode: &Episode| {
@@ -130,7 +132,8 @@ fn print(
         schema_version: manifest.map(|m| m.schema_version),
         episodes: report.episodes,
         steps: report.steps,
-        content: manifest.map(|m| m.content.as_str()).filter(|content| !content.is_empty()),
+        // the manifest's digest is that of the episodes that were found only if all are there and sound
+        content: manifest.filter(|_| report.is_clean()).map(|m| m.content.as_str()),
         problems: &report.problems,
         unlisted: report.unlisted,
         notes: &report.notes,

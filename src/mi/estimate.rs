@@ -1,9 +1,19 @@
 //! The output row, and its three file forms.
 
-use polars::prelude::{Column, CsvWriter, DataFrame, ParquetWriter, SerWriter as _};
+use std::fs::File;
+use std::io::{BufRead as _, BufReader, Read as _};
+use std::path::Path;
+
+use polars::prelude::{
+    Column, CsvWriter, DataFrame, ParquetReader, ParquetWriter, PlSmallStr, SerReader as _, SerWriter as _,
+};
 use serde::Serialize;
 
+use crate::io;
 use crate::schema::SampleLabels;
+
+/// Largest file of estimates that is recognised, bytes.
+const FILE_LIMIT: u64 = 64 << 20;
 
 /// What the value is to the truth.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -143,6 +153,35 @@ pub fn to_csv(rows: &[Estimate]) -> Result<Vec<u8>, String> {
     let mut bytes = Vec::new();
     CsvWriter::new(&mut bytes).finish(&mut frame(rows)?).map_err(|e| e.to_string())?;
     Ok(bytes)
+}
+
+/// Whether a file holds such rows and nothing else, by its ending and its columns; an empty file is nobody's.
+pub fn is_estimates(path: &Path) -> bool {
+    let keys: Vec<String> = match frame(&[]) {
+        Ok(frame) => frame.get_column_names().iter().map(ToString::to_string).collect(),
+        Err(_) => return false,
+    };
+    let Ok(file) = File::open(path) else { return false };
+    if file.metadata().is_ok_and(|file| file.is_file() && file.len() == 0) {
+        return true;
+    }
+    match path.extension().map(|ending| ending.to_string_lossy().to_lowercase()).as_deref() {
+        Some("json") => {
+            let text = io::read_text(path, FILE_LIMIT).unwrap_or_default();
+            let rows = serde_json::from_str::<Vec<serde_json::Map<String, serde_json::Value>>>(&text);
+            rows.is_ok_and(|rows| rows.iter().all(|row| row.keys().eq(&keys)))
+        }
+        Some("csv") => {
+            let mut header = String::new();
+            let read = BufReader::new(file.take(4096)).read_line(&mut header);
+            read.is_ok() && header.trim_end() == keys.join(",")
+        }
+        Some("parquet") => {
+            let schema = io::caught(|| ParquetReader::new(file).schema());
+            schema.is_some_and(|schema| schema.is_ok_and(|s| s.iter_names().map(PlSmallStr::as_str).eq(keys.iter())))
+        }
+        _ => false,
+    }
 }
 
 fn frame(rows: &[Estimate]) -> Result<DataFrame, String> {

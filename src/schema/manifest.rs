@@ -42,6 +42,12 @@ pub struct Manifest {
     /// Episodes that were to be recorded, while they are not all there; 0 in a complete store, or when nobody knew.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub planned: u64,
+    /// In an unsealed manifest: what is making the store, unless it is a recording. `convert` does.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub task: String,
+    /// In a store that was saved from a damaged one: the numbers that its episodes had there, as ranges \[from, to).
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub kept: Vec<[u64; 2]>,
     /// Scenario name, profile and every constant.
     pub scenario: Value,
     /// Link prior and its parameters.
@@ -74,6 +80,8 @@ impl Manifest {
             episodes: 0,
             steps: 0,
             planned: 0,
+            task: String::new(),
+            kept: Vec::new(),
             scenario,
             link,
             policy,

@@ -30,6 +30,7 @@ mod diagnose;
 mod proto;
 mod sink;
 mod source;
+mod tail;
 mod viewer;
 
 use std::path::Path;
@@ -59,7 +60,7 @@ pub(super) const ENTRY: Entry<Format> = Entry {
     summary: "one .mcap file of protobuf messages",
     reference: "MCAP specification",
     value: None,
-    build: Format { claims, create, open, salvage, diagnose: diagnose::diagnose },
+    build: Format { claims, create, open, salvage, diagnose: diagnose::diagnose, viewer: source::draws },
 };
 
 fn claims(path: &Path) -> bool {

@@ -5,8 +5,10 @@
 mod convert;
 mod lock;
 mod mcap;
+mod names;
 mod parquet;
 mod recover;
+mod rescue;
 mod tally;
 mod verify;
 
@@ -17,13 +19,16 @@ pub use parquet::PairsWriter;
 use crate::io::IoError;
 use crate::registry::Entry;
 use crate::schema::{Episode, Manifest, SchemaError};
+use names::{carries, publish, start_partial};
 use tally::Tally;
 use verify::Findings;
 
 pub use convert::convert;
 pub use lock::Owner;
+pub use names::refuse_within_store;
 pub use recover::{Recovered, recover};
-pub use verify::{Problem, Report, Watch, verify};
+pub use rescue::{Rescued, rescue};
+pub use verify::{Problem, Report, Watch, ranges, verify};
 
 /// All formats, in the order in which a path is offered to them; the last takes what none claims.
 pub const FORMATS: &[Entry<Format>] = &[mcap::ENTRY, parquet::ENTRY];
@@ -59,6 +64,8 @@ pub struct Format {
     salvage: fn(&Path) -> Result<Box<dyn EpisodeSource>, StorageError>,
     /// Reports everything that is wrong with a store that the reader refused.
     diagnose: fn(&Path, &mut Findings<'_>) -> Result<(), StorageError>,
+    /// Whether a store has what viewers draw; true of forms that never have it, so that a copy in another form does.
+    viewer: fn(&Path) -> bool,
 }
 
 /// Takes episodes in index order and seals them into a store.
@@ -142,7 +149,7 @@ pub enum StorageError {
         path: PathBuf,
     },
     /// The file ends too early.
-    #[error("cut short: {episodes} of its episodes are whole; record again, or copy the file again: {}", path.display())]
+    #[error("{}: {}", cut_short(*episodes, path), path.display())]
     Truncated {
         /// Whole episodes before the cut.
         episodes: u64,
@@ -150,19 +157,21 @@ pub enum StorageError {
         path: PathBuf,
     },
     /// Somebody is writing it.
-    #[error("{owner} is writing it right now: wait until it has ended, or give another --out: {}", path.display())]
+    #[error("{owner} is writing it right now: wait until it has ended, or take another name: {}", path.display())]
     Busy {
         /// Who.
         owner: Owner,
         /// What is being written.
         path: PathBuf,
     },
-    /// What is left of a recording that did not finish.
+    /// What is left of a recording or a conversion that did not finish.
     #[error(
-        "its recording did not finish; `ccmarl recover {}` puts its whole episodes in place, --force records anew: {}",
+        "its {what} did not finish; `ccmarl recover {}` puts its whole episodes in place, the same command with --force starts anew: {}",
         printable(target), path.display()
     )]
     Unfinished {
+        /// `recording` or `conversion`.
+        what: &'static str,
         /// The store's name.
         target: PathBuf,
         /// The hidden `.partial` beside it.
@@ -179,6 +188,46 @@ pub enum StorageError {
         /// The name.
         path: PathBuf,
     },
+    /// A directory's name with the ending of a file.
+    #[error(
+        "a name in .{extension} is a file's, and / a directory's: leave out the one or the other: {}",
+        path.display()
+    )]
+    Slash {
+        /// The ending.
+        extension: String,
+        /// The name.
+        path: PathBuf,
+    },
+    /// An output inside a store.
+    #[error("the output would lie inside the store {}: give a place outside of it: {}", printable(store), path.display())]
+    Within {
+        /// The store, or what is being written of one.
+        store: PathBuf,
+        /// The output.
+        path: PathBuf,
+    },
+    /// A store has its name: nothing was left unfinished.
+    #[error(
+        "nothing to recover: it is no unfinished recording; where `ccmarl verify` finds damage, `ccmarl recover {} --out NEW` saves what is sound: {}",
+        printable(path), path.display()
+    )]
+    Finished {
+        /// Where.
+        path: PathBuf,
+    },
+    /// Nothing is damaged.
+    #[error("nothing to recover: it is whole; `ccmarl verify` checks it, `ccmarl convert` copies it: {}", path.display())]
+    Whole {
+        /// Where.
+        path: PathBuf,
+    },
+    /// What a kill left holds nothing.
+    #[error("killed before its first episode was committed: there is nothing to recover; start again with --force: {}", path.display())]
+    Empty {
+        /// Where.
+        path: PathBuf,
+    },
     /// A digest or a structure does not match.
     #[error("damaged: {message}: {}", path.display())]
     Damaged {
@@ -187,6 +236,13 @@ pub enum StorageError {
         /// Where.
         path: PathBuf,
     },
+}
+
+impl StorageError {
+    /// Whether the user's words are at fault, not the data or the machine.
+    pub fn is_usage(&self) -> bool {
+        matches!(self, Self::Extension { .. } | Self::Slash { .. } | Self::Within { .. } | Self::Io(IoError::Exists(_)))
+    }
 }
 
 /// Starts a store at `path`, with what viewers draw; its extension chooses the format (`.mcap`, `.parquet`, anything
@@ -203,8 +259,7 @@ pub fn create(path: &Path, manifest: &Manifest, force: bool) -> Result<Box<dyn E
 /// # Errors
 /// As [`create`].
 pub fn create_with(path: &Path, manifest: &Manifest, options: Options) -> Result<Box<dyn EpisodeSink>, StorageError> {
-    check_name(path)?;
-    crate::io::refuse_existing(path, options.force)?;
+    names::check_output(path, options.force)?;
     crate::io::keep_freed_memory();
     (format_of(path).build.create)(path, manifest, options)
 }
@@ -215,7 +270,8 @@ pub fn create_with(path: &Path, manifest: &Manifest, options: Options) -> Result
 /// [`StorageError`] when it is missing, not a store, of a newer version, or damaged.
 pub fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
     if let Some((path, target)) = recover::unfinished(path) {
-        return Err(StorageError::Unfinished { target, path });
+        lock::refuse_living(&path)?;
+        return Err(names::unfinished(&target, path));
     }
     if !path.exists() {
         return Err(IoError::Missing(path.to_owned()).into());
@@ -238,68 +294,20 @@ pub fn check_table(path: &Path) -> Result<(), StorageError> {
     parquet::check_table(path)
 }
 
-/// Refuses a name whose ending looks like that of another kind of file. A number is no such ending (`dropout-0.2`), and
-/// a name that ends in a slash, or is a directory already, is a directory's.
-fn check_name(path: &Path) -> Result<(), StorageError> {
-    let Some(extension) = path.extension() else { return Ok(()) };
-    let extension = extension.to_string_lossy().into_owned();
-    let known = ["parquet", "mcap"].iter().any(|known| extension.eq_ignore_ascii_case(known));
-    let number = extension.starts_with(|c: char| c.is_ascii_digit());
-    if known || number || path.as_os_str().as_encoded_bytes().ends_with(b"/") || path.is_dir() {
-        return Ok(());
-    }
-    Err(StorageError::Extension { extension, path: path.to_owned() })
-}
-
-/// Where a store is built: checks that `path` and its `.partial` sibling may be replaced and that nobody writes there,
-/// removes an old sibling, makes the directories above. With `force`, only empty directories and what ccmarl made are
-/// replaced.
-fn start_partial(path: &Path, force: bool) -> Result<PathBuf, StorageError> {
-    crate::io::refuse_existing(path, force)?;
-    if path.symlink_metadata().is_ok() && !is_ours(path)? {
-        return Err(IoError::Foreign(path.to_owned()).into());
-    }
-    let partial = crate::io::partial_path(path);
-    if partial.symlink_metadata().is_ok() {
-        lock::hold_leftover(&partial)?;
-        if !force {
-            return Err(StorageError::Unfinished { target: path.to_owned(), path: partial });
-        }
-        crate::io::remove(&partial)?;
-    }
-    crate::io::create_parent(path)?;
-    Ok(partial)
-}
-
-/// Whether ccmarl made what stands at `path`: an empty directory or file, one with a rollout manifest, or a file that
-/// carries one.
-fn is_ours(path: &Path) -> Result<bool, IoError> {
-    if path.is_dir() {
-        if std::fs::read_dir(path).map_err(IoError::os("list", path))?.next().is_none() {
-            return Ok(true);
-        }
-        let manifest = crate::io::read_text(&path.join("manifest.json"), MANIFEST_LIMIT).unwrap_or_default();
-        let json: serde_json::Value = serde_json::from_str(&manifest).unwrap_or_default();
-        return Ok(json["kind"] == "rollouts");
-    }
-    let size = path.metadata().map_err(IoError::os("read", path))?.len();
-    Ok(size == 0 || carries(path, "ccmarl.manifest")?)
-}
-
-/// Whether a file has this metadata key in its last mebibyte.
-fn carries(path: &Path, key: &str) -> Result<bool, IoError> {
-    use std::io::{Read as _, Seek as _, SeekFrom};
-    let mut file = std::fs::File::open(path).map_err(IoError::os("open", path))?;
-    let size = file.metadata().map_err(IoError::os("read", path))?.len();
-    let mut tail = Vec::new();
-    file.seek(SeekFrom::Start(size.saturating_sub(1 << 20))).map_err(IoError::os("read", path))?;
-    file.take(1 << 20).read_to_end(&mut tail).map_err(IoError::os("read", path))?;
-    Ok(tail.windows(key.len()).any(|w| w == key.as_bytes()))
-}
-
 /// The first format that claims the path; Parquet when none does.
 fn format_of(path: &Path) -> &'static Entry<Format> {
     FORMATS.iter().find(|e| (e.build.claims)(path)).unwrap_or(&FORMATS[FORMATS.len() - 1])
+}
+
+/// What is said of a file that ends too early; what can be done with it depends on what it holds.
+fn cut_short(episodes: u64, path: &Path) -> String {
+    match episodes {
+        0 => "cut short, and no episode of it is whole: copy it again, or record again".to_owned(),
+        _ => format!(
+            "cut short after {episodes} whole episodes: copy it again, or keep these with `ccmarl recover --force {}`",
+            printable(path)
+        ),
+    }
 }
 
 fn printable(path: &Path) -> String {

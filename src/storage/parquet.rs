@@ -17,7 +17,8 @@
 //!
 //! # When it fails
 //! Until it is finished a store lives in the hidden sibling `.<name>.partial`, with a journal (an Arrow IPC stream)
-//! that holds all committed episodes; a kill leaves that, and `recover` reads it. Reading checks the digest of a file before it is decoded.
+//! that holds all committed episodes and their content hashes; a kill leaves that, and `recover` reads it. A journal also
+//! knows the digests of the parts that are sealed by then. Reading checks the digest of a file before it is decoded.
 //!
 //! # Reference
 //! Apache Parquet format 2.10; RLDS step flags (Ramos et al. 2021, arXiv 2111.02767).
@@ -31,6 +32,7 @@ mod diagnose;
 mod encoder;
 mod group;
 mod journal;
+mod journal_reader;
 mod pages;
 mod pairs;
 mod salvage;
@@ -65,7 +67,7 @@ pub(super) const ENTRY: Entry<Format> = Entry {
     summary: "a directory of Parquet parts with a manifest, or one .parquet file",
     reference: "Apache Parquet",
     value: None,
-    build: Format { claims, create, open, salvage, diagnose: diagnose::diagnose },
+    build: Format { claims, create, open, salvage, diagnose: diagnose::diagnose, viewer: |_| true },
 };
 
 fn claims(path: &Path) -> bool {

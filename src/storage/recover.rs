@@ -2,8 +2,9 @@
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::{Options, StorageError, format_of, lock};
+use super::{EpisodeSource, Options, StorageError, format_of, lock, names, publish};
 use crate::io::{self, IoError};
 use crate::schema::{Episode, Manifest};
 
@@ -44,7 +45,7 @@ pub(super) fn unfinished(path: &Path) -> Option<(PathBuf, PathBuf)> {
 }
 
 /// `.<name>.partial` → `<name>`.
-fn target_of(partial: &Path) -> Option<PathBuf> {
+pub(super) fn target_of(partial: &Path) -> Option<PathBuf> {
     let name = partial.file_name()?.as_encoded_bytes();
     let name = name.strip_prefix(b".")?.strip_suffix(b".partial")?;
     let target = partial.with_file_name(os_str(name)?);
@@ -65,7 +66,8 @@ fn os_str(bytes: &[u8]) -> Option<&OsStr> {
 /// Puts the whole episodes of an unfinished store under its name, and removes what was left; what cannot be read to its
 /// end is kept beside it instead. `path` is the name, or
 /// what is left beside it, or a finished file that was cut short; that one is replaced only with `force`. Memory is
-/// bounded. A kill meanwhile loses nothing: what was left goes last.
+/// bounded. A kill meanwhile loses nothing: what was left goes last. `None` when `stop` turned true; all is as before
+/// then.
 ///
 /// # Errors
 /// [`StorageError`] when there is nothing to recover, the name is taken and `force` is not given, a program is still
@@ -74,7 +76,8 @@ pub fn recover(
     path: &Path,
     force: bool,
     watch: &mut dyn FnMut(&Manifest, &Episode),
-) -> Result<Recovered, StorageError> {
+    stop: &AtomicBool,
+) -> Result<Option<Recovered>, StorageError> {
     let (leftover, target) = match unfinished(path) {
         Some(found) => found,
         None if io::partial_path(path).exists() => (io::partial_path(path), path.to_owned()),
@@ -82,15 +85,15 @@ pub fn recover(
         None => return Err(IoError::Missing(path.to_owned()).into()),
     };
     if leftover == target {
-        let whole = |path: PathBuf| {
-            let message =
-                "it is no unfinished recording: nothing to recover; `ccmarl verify` says what is wrong".to_owned();
-            StorageError::NotAStore { message, path }
-        };
         match super::open(&target) {
             Err(StorageError::Truncated { .. }) => {}
+            Err(StorageError::Damaged { message, path }) => {
+                let name = io::printable(&target.display().to_string());
+                let message = format!("{message}; `ccmarl recover {name} --out NEW` saves what is sound");
+                return Err(StorageError::Damaged { message, path });
+            }
             Err(error) => return Err(error),
-            Ok(_) => return Err(whole(target)),
+            Ok(_) => return Err(StorageError::Finished { path: target }),
         }
     }
     let _held = lock::hold_leftover(&leftover)?;
@@ -102,15 +105,11 @@ pub fn recover(
         // the kill came when the store had its name, before the empty rest was removed
         io::remove(&leftover)?;
         let episodes = store.manifest().episodes;
-        return Ok(Recovered {
-            path: target,
-            episodes,
-            planned: store.manifest().planned.max(episodes),
-            ended: None,
-            kept: None,
-        });
+        let planned = store.manifest().planned.max(episodes);
+        return Ok(Some(Recovered { path: target, episodes, planned, ended: None, kept: None }));
     }
     io::refuse_existing(&target, force)?;
+    names::refuse_foreign(&target)?;
     let mut source = (format.salvage)(&leftover)?;
     let manifest = source.manifest().clone();
     let mut recovered =
@@ -119,27 +118,23 @@ pub fn recover(
     let mut name = std::ffi::OsString::from(".recovered.");
     name.push(target.file_name().unwrap_or("out".as_ref()));
     let built = target.with_file_name(name);
-    let mut sink = (format.create)(&built, &manifest, Options { force: true, viewer: true })?;
-    loop {
-        match source.next_episode() {
-            Ok(Some(episode)) => {
-                sink.append(&episode)?;
-                recovered.episodes += 1;
-                watch(&manifest, &episode);
-            }
-            Ok(None) | Err(StorageError::Truncated { .. }) => break,
-            Err(error @ StorageError::Io(_)) => return Err(error),
-            Err(error) => {
-                recovered.ended = Some(error.to_string());
-                break;
-            }
+    let options = Options { force: true, viewer: (format.viewer)(&leftover) };
+    let mut sink = (format.create)(&built, &manifest, options)?;
+    while let Some(episode) = next(&mut *source, &mut recovered)? {
+        if stop.load(Ordering::Relaxed) {
+            drop(sink);
+            io::remove(&io::partial_path(&built))?;
+            return Ok(None);
         }
+        sink.append(&episode)?;
+        recovered.episodes += 1;
+        watch(&manifest, &episode);
     }
     if recovered.episodes == 0 {
-        return Ok(recovered); // the sink removes what it began
+        return Ok(Some(recovered)); // the sink removes what it began
     }
     sink.finish()?;
-    io::publish(&built, &target, force, "manifest.json")?;
+    publish(&built, &target, force)?;
     if recovered.ended.is_some() && leftover != target {
         // what cannot be read now may hold more: it stays, where nothing takes it for a recording
         let mut names = (1..=u32::MAX).map(|k| leftover.with_extension(format!("unrecovered-{k}")));
@@ -149,5 +144,18 @@ pub fn recover(
     } else if leftover != target {
         io::remove(&leftover)?;
     }
-    Ok(recovered)
+    Ok(Some(recovered))
+}
+
+/// The next episode; `None` at the end of what is whole, and why it ends there goes into `recovered`.
+fn next(source: &mut dyn EpisodeSource, recovered: &mut Recovered) -> Result<Option<Episode>, StorageError> {
+    match source.next_episode() {
+        Err(StorageError::Truncated { .. }) => Ok(None),
+        Err(error @ StorageError::Io(_)) => Err(error),
+        Err(error) => {
+            recovered.ended = Some(error.to_string());
+            Ok(None)
+        }
+        read => read,
+    }
 }

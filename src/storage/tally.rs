@@ -63,6 +63,7 @@ impl Tally {
         manifest.episodes = self.episodes;
         manifest.steps = self.steps;
         manifest.content = self.content();
+        manifest.task.clear();
         if manifest.planned <= self.episodes {
             manifest.planned = 0; // all there
         }
@@ -133,4 +134,28 @@ fn finite(layout: &Layout, e: &Episode) -> Result<(), SchemaError> {
         check("reward.", &a.name, 1, &e.rewards[i])?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counts_and_digests_that_differ_are_named() {
+        let layout = Layout { agents: Vec::new(), state_fields: Vec::new() };
+        let manifest = |episodes: u64, steps: u64| Manifest {
+            episodes,
+            steps,
+            ..Manifest::new(1, serde_json::Value::Null, serde_json::Value::Null, serde_json::Value::Null, &layout)
+        };
+        let tally = Tally { episodes: 2, steps: 5, ..Tally::default() };
+        let compared = |m: &Manifest| tally.compare(m, Path::new("x")).unwrap_err().to_string();
+        assert_eq!(compared(&manifest(3, 5)), "damaged: expected 3 episodes, found 2: x");
+        assert_eq!(compared(&manifest(2, 6)), "damaged: expected 6 steps, found 5: x");
+        let digest = "damaged: the episodes do not have the content digest of the manifest: x";
+        assert_eq!(compared(&manifest(2, 5)), digest);
+        let long = Episode { steps: i32::MAX as usize, ..Episode::default() };
+        let error = check(&layout, &long, 0).unwrap_err().to_string();
+        assert_eq!(error, "column step: 2147483647 steps are more than a step number holds");
+    }
 }

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::{StorageError, format_of, recover};
+use super::{StorageError, format_of, lock, names, recover};
 use crate::io::IoError;
 use crate::schema::{Episode, Manifest};
 
@@ -59,10 +59,29 @@ pub type Watch<'a> = dyn FnMut(&Manifest, &Episode) -> Option<(&'static str, Str
 /// Collects what is found.
 pub(super) struct Findings<'a> {
     report: Report,
+    /// A manifest with its own digest right.
+    trusted: Option<Manifest>,
+    /// Number of the last sound episode.
+    last: Option<u64>,
     watch: &'a mut Watch<'a>,
 }
 
-impl Findings<'_> {
+impl<'a> Findings<'a> {
+    /// Nothing yet.
+    pub(super) fn new(watch: &'a mut Watch<'a>) -> Self {
+        Self { report: Report::default(), trusted: None, last: None, watch }
+    }
+
+    /// Takes note of a manifest whose own digest is right; the first one stays.
+    pub(super) fn trust(&mut self, manifest: &Manifest) {
+        self.trusted.get_or_insert_with(|| manifest.clone());
+    }
+
+    /// A manifest that can be believed, if there is one.
+    pub(super) fn trusted(&self) -> Option<&Manifest> {
+        self.trusted.as_ref()
+    }
+
     /// Something is wrong.
     pub(super) fn wrong(&mut self, check: &'static str, place: &str, message: String) {
         self.push(Problem { check, place: place.to_owned(), message, lost: false });
@@ -103,7 +122,10 @@ impl Findings<'_> {
             return None;
         };
         let manifest = match Manifest::parse(text) {
-            Ok(manifest) => Some(manifest),
+            Ok(manifest) => {
+                self.trusted = Some(manifest.clone());
+                Some(manifest)
+            }
             Err(error) => {
                 self.wrong("manifest", place, error.to_string());
                 Manifest::parse_damaged(text).ok()
@@ -120,6 +142,11 @@ impl Findings<'_> {
 
     /// Counts a sound episode, and asks the caller for its opinion.
     pub(super) fn episode(&mut self, episode: &Episode) {
+        if self.last.is_some_and(|last| episode.index <= last) {
+            let place = format!("episode {}", episode.index);
+            return self.wrong("rows", &place, "it is there twice, or out of order".to_owned());
+        }
+        self.last = Some(episode.index);
         self.report.episodes += 1;
         self.report.steps += episode.steps as u64;
         let Some(manifest) = self.report.manifest.take() else { return };
@@ -147,8 +174,9 @@ impl Findings<'_> {
 /// # Errors
 /// [`StorageError`] when there is nothing at `path`, it is no store, or the disk refuses.
 pub fn verify<'a>(path: &Path, watch: &'a mut Watch<'a>) -> Result<Report, StorageError> {
-    let mut findings = Findings { report: Report::default(), watch };
+    let mut findings = Findings::new(watch);
     if let Some((leftover, target)) = recover::unfinished(path) {
+        lock::refuse_living(&leftover)?;
         unfinished(&leftover, &target, &mut findings)?;
         return Ok(findings.report);
     }
@@ -160,7 +188,7 @@ pub fn verify<'a>(path: &Path, watch: &'a mut Watch<'a>) -> Result<Report, Stora
         Ok(()) => strays(path, &mut findings)?,
         Err(error @ (StorageError::Io(_) | StorageError::NotAStore { .. })) => return Err(error),
         Err(error) => {
-            findings.report = Report::default();
+            (findings.report, findings.last) = (Report::default(), None);
             (format_of(path).build.diagnose)(path, &mut findings)?;
             if findings.is_clean() {
                 findings.error("reading", "store", &error);
@@ -168,17 +196,39 @@ pub fn verify<'a>(path: &Path, watch: &'a mut Watch<'a>) -> Result<Report, Stora
             strays(path, &mut findings)?;
         }
     }
-    if let Some(manifest) = &findings.report.manifest
-        && manifest.planned > 0
-    {
-        let note = format!("{} of {} planned episodes: the recording was stopped", manifest.episodes, manifest.planned);
-        findings.report.notes.push(note);
-    }
+    let notes = findings.report.manifest.as_ref().map(notes).unwrap_or_default();
+    findings.report.notes.extend(notes);
     Ok(findings.report)
 }
 
+/// What a sealed manifest says that a user should know.
+fn notes(manifest: &Manifest) -> Vec<String> {
+    let mut notes = Vec::new();
+    if manifest.planned > 0 && !manifest.content.is_empty() {
+        let (episodes, planned) = (manifest.episodes, manifest.planned);
+        let why =
+            if manifest.kept.is_empty() { "the recording was stopped, or cut short" } else { "the others were lost" };
+        notes.push(format!("{episodes} of {planned} planned episodes: {why}"));
+    }
+    if !manifest.kept.is_empty() {
+        let numbers = ranges(&manifest.kept);
+        notes.push(format!("saved from a damaged store, where its episodes were numbered {numbers}"));
+    }
+    notes
+}
+
+/// Ranges \[from, to) in words.
+pub fn ranges(ranges: &[[u64; 2]]) -> String {
+    let one = |[from, to]: &[u64; 2]| {
+        if to.saturating_sub(1) <= *from { from.to_string() } else { format!("{from} to {}", to - 1) }
+    };
+    let shown: Vec<String> = ranges.iter().take(20).map(one).collect();
+    let more = ranges.len().saturating_sub(20);
+    if more > 0 { format!("{} and {more} more ranges", shown.join(", ")) } else { shown.join(", ") }
+}
+
 /// Reads all episodes as any reader does.
-fn read(path: &Path, findings: &mut Findings<'_>) -> Result<(), StorageError> {
+pub(super) fn read(path: &Path, findings: &mut Findings<'_>) -> Result<(), StorageError> {
     let mut source = super::open(path)?;
     findings.describe(source.manifest());
     while let Some(episode) = source.next_episode()? {
@@ -205,7 +255,7 @@ fn strays(path: &Path, findings: &mut Findings<'_>) -> Result<(), StorageError> 
 
 /// Counts what a kill left.
 fn unfinished(leftover: &Path, target: &Path, findings: &mut Findings<'_>) -> Result<(), StorageError> {
-    let mut ended = String::new();
+    let place = leftover.display().to_string();
     match (format_of(target).build.salvage)(leftover) {
         Ok(mut source) => {
             findings.describe(source.manifest());
@@ -213,23 +263,32 @@ fn unfinished(leftover: &Path, target: &Path, findings: &mut Findings<'_>) -> Re
                 match source.next_episode() {
                     Ok(Some(episode)) => findings.episode(&episode),
                     Ok(None) | Err(StorageError::Truncated { .. }) => break,
+                    Err(error @ StorageError::Io(_)) => return Err(error),
                     Err(error) => {
-                        ended = format!("; then: {error}");
+                        findings.error("journal", &place, &error);
                         break;
                     }
                 }
             }
         }
         Err(error @ StorageError::Io(_)) => return Err(error),
-        Err(error) => ended = format!("; {error}"),
+        Err(StorageError::Empty { .. }) => {
+            let message = "it was killed before its first episode was committed: start again with --force".to_owned();
+            findings.lost("recording", &place, message);
+            return Ok(());
+        }
+        Err(error) => findings.error("journal", &place, &error),
     }
-    let planned = findings.report.manifest.as_ref().map_or(0, |m| m.planned);
+    let manifest = findings.report.manifest.as_ref();
+    let (planned, task) = manifest.map_or((0, ""), |m| (m.planned, &m.task[..]));
     let of = if planned > 0 { format!(" of {planned} planned") } else { String::new() };
+    let again = if task.is_empty() { "" } else { ", and the same command with --force starts anew" };
     let message = format!(
-        "the recording did not finish: {}{of} episodes are whole{ended}; `ccmarl recover {}` puts them in place",
+        "the {} did not finish: {}{of} episodes are whole; `ccmarl recover {}` puts them in place{again}",
+        names::what(task),
         findings.report.episodes,
         target.display()
     );
-    findings.lost("recording", &leftover.display().to_string(), message);
+    findings.lost("recording", &place, message);
     Ok(())
 }

@@ -167,6 +167,8 @@ impl Target {
             let mut sink = storage::create(&store, &manifest(&layout), false).unwrap();
             sink.append_all(&episodes).unwrap();
             sink.commit().unwrap();
+            drop(sink);
+            super::integrity::settle(&store);
             (file, fix) = (at(".store.partial").join("journal-00000.arrows"), |_: &mut [u8]| {});
         } else {
             write(&store, &layout, &episodes, false).unwrap();

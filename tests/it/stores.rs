@@ -303,6 +303,7 @@ fn an_unfinished_recording_keeps_its_committed_episodes_and_is_not_overwritten()
             assert_eq!(rows, episodes[..3].iter().map(Episode::rows).sum::<usize>());
         }
         drop(sink);
+        super::integrity::settle(&path);
         assert!(partial.exists() && !path.exists());
         let error = message(read(&path));
         assert!(error.contains("its recording did not finish; `ccmarl recover"), "{error}");
@@ -389,7 +390,7 @@ fn what_is_no_store_says_what_to_give_instead() {
 }
 
 /// Puts a changed manifest over a directory store, with its digest made right again.
-fn reseal(store: &Path, change: impl Fn(&mut Manifest)) {
+pub(crate) fn reseal(store: &Path, change: impl Fn(&mut Manifest)) {
     let path = store.join("manifest.json");
     let mut manifest = Manifest::parse(&fs::read_to_string(&path).unwrap()).unwrap();
     change(&mut manifest);
@@ -400,7 +401,10 @@ fn reseal(store: &Path, change: impl Fn(&mut Manifest)) {
 fn a_manifest_that_lies_is_an_error() {
     type Change = fn(&mut Manifest);
     let layout = small();
-    let cases: [(Change, &str); 9] = [
+    let cases: [(Change, &str); 12] = [
+        (|m| m.content = "0".repeat(64), "the episodes do not have the content digest of the manifest"),
+        (|m| m.parts[0].episodes = [1, 4], "part-00000.parquet: expected episodes from 0 on, found 1 to 4"),
+        (|m| m.kind = "runs".to_owned(), "kind: expected \"rollouts\", found \"runs\""),
         (|m| m.schema_version = 2, "schema version 2 is newer"),
         (|m| m.episodes = u64::MAX, "the parts hold 4 episodes"),
         (|m| m.steps += 1, "steps, found"),
@@ -453,6 +457,25 @@ fn doubled_missing_or_mistyped_rows_are_errors_even_when_every_digest_is_right()
         });
         RecordBatch::try_from_iter_with_nullable(columns).unwrap()
     };
+    // the same rows with one column replaced
+    let with = |name: &str, column: arrow::array::ArrayRef| {
+        let schema = rows.schema();
+        let columns = schema.fields().iter().zip(rows.columns()).map(|(f, c)| {
+            let column = if f.name() == name { &column } else { c };
+            (f.name().clone(), std::sync::Arc::clone(column), column.null_count() > 0)
+        });
+        RecordBatch::try_from_iter_with_nullable(columns).unwrap()
+    };
+    let bools = |true_at: usize| -> arrow::array::ArrayRef {
+        std::sync::Arc::new((0..9).map(|row| Some(row == true_at)).collect::<arrow::array::BooleanArray>())
+    };
+    let no_null: arrow::array::ArrayRef = std::sync::Arc::new(arrow::array::Float32Array::from(vec![1.0; 9]));
+    let (first, terminal, rewards) =
+        (with("is_first", bools(0)), with("is_terminal", bools(1)), with("reward", no_null));
+    let step_null = with(
+        "step",
+        std::sync::Arc::new((0..9).map(|r| (r != 4).then_some(r % 3)).collect::<arrow::array::Int32Array>()),
+    );
     let twice = concat_batches(&rows.schema(), [&rows.slice(0, 3), &rows.slice(0, 6)]).unwrap();
     let gap = concat_batches(&rows.schema(), [&rows.slice(0, 3), &rows.slice(6, 3)]).unwrap();
     for (name, batch, expected) in [
@@ -461,6 +484,15 @@ fn doubled_missing_or_mistyped_rows_are_errors_even_when_every_digest_is_right()
         ("gap", gap, "expected episode 1 step 0, found episode 2 step 0"),
         ("torn", rows.slice(0, 8), "episode 2 ends after 2 rows without is_last"),
         ("headless", rows.slice(1, 8), "expected episode 0 step 0, found episode 0 step 1"),
+        ("first", first, "column is_first: episode 1 step 0 has false"),
+        ("terminal", terminal, "column is_terminal: episode 0 step 1 is not the last"),
+        ("rewards", rewards, "column reward: step 2: null is for the last row of an episode, and only there"),
+        ("step-null", step_null, "column step: expected no null, found 1"),
+        (
+            "narrow",
+            rows.project(&(0..rows.num_columns() - 1).collect::<Vec<_>>()).unwrap(),
+            "column reward.agent_2 is missing",
+        ),
     ] {
         let path = directory.path().join(name);
         fs::create_dir(&path).unwrap();

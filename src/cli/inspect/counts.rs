@@ -3,9 +3,10 @@
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
 
 use crate::Error;
-use crate::schema::{Episode, Layout, Manifest};
+use crate::schema::{Episode, Layout, Manifest, hex};
 use crate::stats::ExactSum;
 
 /// What a part file calls itself.
@@ -13,6 +14,7 @@ const KIND: &str = "inspect-part";
 
 /// Counts over some episodes of a store. Sums are exact, so that their value does not depend on how they were parted.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub(super) struct Counts {
     /// Bits of the return of each episode (JSON has no exact floats), in order.
     returns: Vec<u64>,
@@ -101,10 +103,42 @@ impl Counts {
             *lost += more;
         }
     }
+
+    /// Whether `episodes` episodes of a store with this manifest can have these counts; otherwise what cannot be.
+    fn check(&self, manifest: &Manifest, episodes: u64) -> Result<(), String> {
+        let layout = manifest.layout();
+        let n = layout.communicators().len();
+        let found = self.returns.len() as u64;
+        if found != episodes {
+            return Err(format!("{episodes} episodes have {found} returns"));
+        }
+        if let Some(bad) = self.returns().into_iter().find(|value| !value.is_finite()) {
+            return Err(format!("a return is {bad}"));
+        }
+        if self.terminal > episodes || self.steps > manifest.steps {
+            let (terminal, steps) = (self.terminal, self.steps);
+            return Err(format!("{episodes} episodes have {terminal} terminal ones and {steps} steps"));
+        }
+        if self.lost.len() != n * n || self.lost.iter().any(|&lost| lost > self.steps) {
+            return Err(format!("its lost messages do not fit {n} communicators and {} steps", self.steps));
+        }
+        if (0..n).any(|agent| self.lost[agent * (n + 1)] > 0) {
+            return Err("an agent lost messages to itself".to_owned());
+        }
+        // an episode without steps adds nothing to some columns, so that they need not be there
+        let mut known = Self::new(&layout);
+        known.add(&layout, &Episode::with_capacity(&layout, 0, 0));
+        match self.sums.keys().find(|column| !known.sums.contains_key(*column)) {
+            Some(column) => Err(format!("the store has no column {column:?}")),
+            None if episodes > 0 && self.sums.len() < known.sums.len() => Err("it lacks sums of columns".to_owned()),
+            None => Ok(()),
+        }
+    }
 }
 
 /// The counts of one shard, as they are written to a file.
 #[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub(super) struct Part {
     kind: String,
     /// The path that was inspected.
@@ -115,31 +149,48 @@ pub(super) struct Part {
     /// The store's manifest.
     pub(super) manifest: Manifest,
     pub(super) counts: Counts,
+    /// SHA-256 of this text with these digits written as zeros.
+    self_sha256: String,
 }
 
 impl Part {
     /// The shard's counts, ready to be written.
     pub(super) fn new(store: String, [shard, shards]: [u64; 2], manifest: Manifest, counts: Counts) -> Self {
-        Self { kind: KIND.to_owned(), store, shard, shards, manifest, counts }
+        Self { kind: KIND.to_owned(), store, shard, shards, manifest, counts, self_sha256: zeros() }
     }
 
-    /// Reads a part and checks that its counts fit its manifest.
+    /// The text of its file, with its digest at the end.
+    pub(super) fn sealed(&self) -> serde_json::Result<String> {
+        let text = serde_json::to_string(self)?;
+        let digest = hex(&Sha256::digest(text.as_bytes()));
+        Ok(text.trim_end_matches(&format!("{}\"}}", zeros())).to_owned() + &digest + "\"}")
+    }
+
+    /// Reads a part and checks its digest, and that its counts fit its manifest.
     pub(super) fn parse(text: &str) -> Result<Self, String> {
         let part: Self = serde_json::from_str(text).map_err(|e| format!("not a part of `inspect --shard`: {e}"))?;
         if part.kind != KIND {
             return Err(format!("expected kind {KIND:?}, found {:?}", part.kind));
         }
-        part.manifest.layout().check().map_err(|e| e.to_string())?;
-        let [from, to] = episodes([part.shard, part.shards], part.manifest.episodes);
-        let (found, links) = (part.counts.returns.len() as u64, part.manifest.layout().communicators().len().pow(2));
-        if part.shard >= part.shards || found != to - from || part.counts.lost.len() != links {
-            return Err(format!(
-                "shard {}/{} of {} episodes cannot have {found} episodes",
-                part.shard, part.shards, part.manifest.episodes
-            ));
+        let zeroed =
+            text.strip_suffix(&format!("{}\"}}", part.self_sha256)).map(|text| text.to_owned() + &zeros() + "\"}");
+        if zeroed.is_none_or(|zeroed| hex(&Sha256::digest(zeroed.as_bytes())) != part.self_sha256) {
+            return Err("self_sha256 does not match its text: the part was changed or damaged".to_owned());
         }
+        part.manifest.layout().check().map_err(|e| e.to_string())?;
+        let (name, all) = (format!("shard {}/{}", part.shard, part.shards), part.manifest.episodes);
+        if part.shard >= part.shards {
+            return Err(format!("there is no {name}: they count from 0"));
+        }
+        let [from, to] = episodes([part.shard, part.shards], all);
+        let checked = part.counts.check(&part.manifest, to - from);
+        checked.map_err(|message| format!("{name} of {all} episodes cannot be: {message}"))?;
         Ok(part)
     }
+}
+
+fn zeros() -> String {
+    "0".repeat(64)
 }
 
 /// Episodes of a shard: from, and one past the last.
@@ -183,7 +234,14 @@ pub(super) fn merge(mut parts: Vec<Part>) -> Result<Part, Error> {
         whole.counts.append(part.counts);
         whole.shard = part.shard;
     }
-    if whole.shard + 1 < whole.shards { missing(whole.shard + 1, whole.shards) } else { Ok(whole) }
+    if whole.shard + 1 < whole.shards {
+        return missing(whole.shard + 1, whole.shards);
+    }
+    if whole.counts.steps != whole.manifest.steps {
+        let (steps, expected) = (whole.counts.steps, whole.manifest.steps);
+        return Err(Error::Usage(format!("all shards have {steps} steps together, the store has {expected}")));
+    }
+    Ok(whole)
 }
 
 #[cfg(test)]

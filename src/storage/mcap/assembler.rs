@@ -192,4 +192,88 @@ mod tests {
         let error = add(&layout, &mut e, &mut rows, row(2, false)).unwrap_err();
         assert_eq!(error, "episode 0 step 2: a row follows the one with is_last");
     }
+
+    #[test]
+    fn every_fault_of_a_row_and_of_an_end_is_named() {
+        use crate::schema::{AgentSpec, Controller};
+        type ChangeRow = fn(&mut proto::Step);
+        type ChangeEnd = fn(&mut proto::Episode);
+        let agent = AgentSpec {
+            name: "a".to_owned(),
+            team: "t".to_owned(),
+            controller: Controller::Policy,
+            learner: true,
+            communicator: true,
+            observation: 1,
+            message: 1,
+            action: 1,
+        };
+        let layout = Layout { agents: vec![agent], state_fields: vec!["x".to_owned()] };
+        let row = |step: u32, last: bool| {
+            let reward = (!last).then_some(1.0);
+            let action = if last { vec![] } else { vec![0.5] };
+            let agent =
+                proto::Agent { name: "a".to_owned(), observation: vec![1.0], message: vec![1.0], action, reward };
+            let (is_first, is_last, agents) = (step == 0, last, vec![agent]);
+            proto::Step {
+                step,
+                is_first,
+                is_last,
+                reward,
+                state: vec![1.0],
+                link: vec![true],
+                agents,
+                ..proto::Step::default()
+            }
+        };
+        // what happens to the second of three rows
+        let rows: [(ChangeRow, &str); 8] = [
+            (|r| r.episode = 1, "expected episode 0 step 1, found episode 1 step 1"),
+            (|r| r.step = 5, "expected episode 0 step 1, found episode 0 step 5"),
+            (|r| r.is_first = true, "episode 0 step 1: is_first, is_last, is_terminal do not fit"),
+            (|r| r.is_terminal = true, "episode 0 step 1: is_first, is_last, is_terminal do not fit"),
+            (|r| r.reward = None, "episode 0 step 1: rewards or agents do not fit"),
+            (|r| r.agents.clear(), "episode 0 step 1: rewards or agents do not fit"),
+            (|r| r.agents[0].name.push('b'), "episode 0 step 1: agent \"ab\" does not fit the manifest's \"a\""),
+            (|r| r.link.clear(), "episode 0 step 1: state or link has the wrong length"),
+        ];
+        for (change, expected) in rows {
+            let (mut e, mut count) = (Episode::with_capacity(&layout, 0, 2), 0);
+            add(&layout, &mut e, &mut count, row(0, false)).unwrap();
+            let mut second = row(1, false);
+            change(&mut second);
+            assert_eq!(add(&layout, &mut e, &mut count, second).unwrap_err(), expected);
+        }
+        let ends: [(ChangeEnd, &str); 5] = [
+            (|e| e.index = 3, "episode 0 of 2 rows: its end says episode 3 of 1 steps"),
+            (|e| e.steps = 9, "episode 0 of 2 rows: its end says episode 0 of 9 steps"),
+            (|e| e.terminal = true, "episode 0 of 2 rows: its end says episode 0 of 1 steps"),
+            (|e| e.content_hash[0] ^= 1, "episode 0 does not have the content hash at its end"),
+            (|e| e.episode_return = 2.0, "episode 0: its end says return 2, its rewards sum to 1"),
+        ];
+        let filled = || {
+            let mut assembler = Assembler::new(layout.clone());
+            for row in [row(0, false), row(1, true)] {
+                add(&layout, &mut assembler.episode, &mut assembler.rows, row).unwrap();
+            }
+            assembler
+        };
+        let whole = Episode { steps: 1, ..filled().episode };
+        let good = || proto::Episode {
+            steps: 1,
+            episode_return: 1.0,
+            content_hash: whole.content_hash().to_vec(),
+            ..proto::Episode::default()
+        };
+        assert_eq!(filled().close(&good()).unwrap().0, whole);
+        for (change, expected) in ends {
+            let mut end = good();
+            change(&mut end);
+            assert_eq!(filled().close(&end).unwrap_err(), expected);
+        }
+        let mut open = Assembler::new(layout.clone());
+        add(&layout, &mut open.episode, &mut open.rows, row(0, false)).unwrap();
+        add(&layout, &mut open.episode, &mut open.rows, row(1, false)).unwrap();
+        assert_eq!(open.close(&good()).unwrap_err(), "episode 0 of 2 rows: its last row has no is_last");
+    }
 }

@@ -34,13 +34,18 @@ pub(super) fn diagnose(path: &Path, findings: &mut Findings<'_>) -> Result<(), S
         scan(path, torn, &mut early).ok();
     }
     if short {
-        findings.lost("length", "file", "it is cut short".to_owned());
+        let message = "it is cut short: copy it again, or keep its whole episodes with `ccmarl recover --force`";
+        findings.lost("length", "file", message.to_owned());
     }
     // the sealed manifest stands at the end, so a file that was cut has none
     let sealed = if short { None } else { findings.manifest("metadata record ccmarl.manifest", sealed.as_deref()) };
-    let Some(manifest) = sealed.or_else(|| recording.and_then(|text| Manifest::parse_damaged(&text).ok())) else {
+    let before = || recording.as_deref().and_then(|text| Manifest::parse_damaged(text).ok());
+    let Some(manifest) = sealed.or_else(before) else {
         return Ok(());
     };
+    if let Some(Ok(recording)) = recording.as_deref().map(Manifest::parse) {
+        findings.trust(&recording);
+    }
     findings.describe(&manifest);
     let mut total = Tally::default();
     episodes(path, &manifest, &mut total, findings)?;

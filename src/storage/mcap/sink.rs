@@ -12,9 +12,9 @@ use prost::Message;
 use super::proto::{self, DESCRIPTORS, VIEWER_DESCRIPTORS};
 use super::viewer::Viewer;
 use super::{EPISODE_TOPIC, JSON_KEY, MANIFEST_RECORD, POSES_TOPIC, RECORDING_RECORD, SCENE_TOPIC, STEP_TOPIC};
-use crate::io::{self, IoError};
+use crate::io::IoError;
 use crate::schema::{Episode, Layout, Manifest, STEP_SECS};
-use crate::storage::{EpisodeSink, Options, StorageError, Tally, lock, start_partial};
+use crate::storage::{EpisodeSink, Options, StorageError, Tally, lock, publish, start_partial};
 
 /// A store under construction, in the hidden sibling `.<name>.partial`.
 pub(super) struct McapSink {
@@ -182,7 +182,7 @@ impl EpisodeSink for McapSink {
         sealed.and_then(|()| self.writer.finish().map(drop)).map_err(|e| refused(e, &self.partial))?;
         let file = File::open(&self.partial).map_err(IoError::os("open", &self.partial))?;
         file.sync_all().map_err(IoError::os("sync", &self.partial))?;
-        io::publish(&self.partial, &self.path, self.force, "manifest.json")?;
+        publish(&self.partial, &self.path, self.force)?;
         self.finished = true;
         Manifest::parse(&text).map_err(schema)
     }

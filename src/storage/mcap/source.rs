@@ -9,7 +9,8 @@ use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOp
 use mcap::{MAGIC, McapError, parse_record};
 
 use super::assembler::{Assembler, Channels};
-use super::{JSON_KEY, MANIFEST_RECORD, RECORDING_RECORD};
+use super::tail::check_tail;
+use super::{JSON_KEY, MANIFEST_RECORD, RECORDING_RECORD, SCENE_TOPIC};
 use crate::io::IoError;
 use crate::schema::{Episode, Manifest};
 use crate::storage::{EpisodeSource, StorageError, Tally};
@@ -75,6 +76,8 @@ pub(super) struct McapSource {
     records: Option<Records<File>>,
     assembler: Assembler,
     total: Tally,
+    /// Whether it may end anywhere.
+    leftover: bool,
 }
 
 impl McapSource {
@@ -98,7 +101,7 @@ impl McapSource {
         };
         let schema = |source| StorageError::Schema { source, path: path.to_owned() };
         let manifest = Manifest::parse(&text).map_err(schema)?;
-        Self::start(path, manifest, LinearReaderOptions::default())
+        Self::start(path, manifest, LinearReaderOptions::default(), false)
     }
 
     /// What a kill left, or a file that was cut short: its whole episodes, then an error that says what is wrong. The
@@ -115,17 +118,29 @@ impl McapSource {
         match (text, found) {
             (Some(text), _) => {
                 let manifest = Manifest::parse(&text).map_err(schema)?.unsealed();
-                Self::start(path, manifest, LinearReaderOptions::default().with_skip_end_magic(true))
+                Self::start(path, manifest, LinearReaderOptions::default().with_skip_end_magic(true), true)
             }
             (None, Err(Stop::Error(error))) => Err(error),
-            (None, _) => Err(StorageError::Truncated { episodes: 0, path: path.to_owned() }),
+            (None, _) => Err(StorageError::Empty { path: path.to_owned() }),
         }
     }
 
-    fn start(path: &Path, manifest: Manifest, options: LinearReaderOptions) -> Result<Self, StorageError> {
+    fn start(
+        path: &Path,
+        manifest: Manifest,
+        options: LinearReaderOptions,
+        leftover: bool,
+    ) -> Result<Self, StorageError> {
         let records = Records::open(path, options.with_prevalidate_chunk_crcs(true))?;
         let assembler = Assembler::new(manifest.layout());
-        Ok(Self { path: path.to_owned(), manifest, records: Some(records), assembler, total: Tally::default() })
+        Ok(Self {
+            path: path.to_owned(),
+            manifest,
+            records: Some(records),
+            assembler,
+            total: Tally::default(),
+            leftover,
+        })
     }
 }
 
@@ -143,7 +158,12 @@ impl EpisodeSource for McapSource {
         });
         let (rows, index) = (assembler.rows(), self.total.episodes);
         match read {
-            Err(Stop::Short) => return Err(StorageError::Truncated { episodes: index, path: self.path.clone() }),
+            Err(Stop::Short) => {
+                if self.leftover {
+                    check_tail(&self.path)?;
+                }
+                return Err(StorageError::Truncated { episodes: index, path: self.path.clone() });
+            }
             Err(Stop::Error(error)) => return Err(error),
             Ok(_) => {}
         }
@@ -152,6 +172,9 @@ impl EpisodeSource for McapSource {
             return Ok(Some(episode));
         }
         self.records = None;
+        if self.leftover {
+            check_tail(&self.path)?;
+        }
         if rows > 0 {
             let message = format!("episode {index} has {rows} rows and no end");
             return Err(StorageError::Damaged { message, path: self.path.clone() });
@@ -223,6 +246,26 @@ pub(super) fn scan(
         Ok(false)
     })?;
     Ok(found)
+}
+
+/// Whether a file draws its episodes: its channels stand before the end of the first one. What cannot be read may.
+pub(super) fn draws(path: &Path) -> bool {
+    let options = LinearReaderOptions::default().with_prevalidate_chunk_crcs(true).with_skip_end_magic(true);
+    let (mut channels, mut found) = (Channels::default(), false);
+    let read = Records::open(path, options).map(|mut records| {
+        records.each(|opcode, body| {
+            match parse_record(opcode, body) {
+                Ok(Record::Channel(channel)) => {
+                    found |= channel.topic == SCENE_TOPIC;
+                    channels.add(body)?;
+                }
+                Ok(Record::Message { header, .. }) if channels.episode.contains(&header.channel_id) => return Ok(true),
+                _ => {}
+            }
+            Ok(found)
+        })
+    });
+    found || !matches!(read, Ok(Ok(_)))
 }
 
 /// Whole episodes of a file that was cut short.

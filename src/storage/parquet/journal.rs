@@ -1,10 +1,14 @@
 //! The journal of a part: an Arrow IPC stream of the episodes appended so far, which survives a kill.
+//!
+//! Beside the store's columns it has one of its own: on each episode's last row the content hash, which `recover` compares.
 
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
-use arrow::datatypes::{Metadata, Schema, SchemaRef};
+use arrow::array::{BinaryArray, RecordBatch};
+use arrow::datatypes::{DataType, Field, Metadata, Schema, SchemaRef};
 use arrow::error::ArrowError;
 use arrow::ipc::writer::StreamWriter;
 
@@ -14,11 +18,17 @@ use crate::io::IoError;
 use crate::schema::{Episode, Layout};
 use crate::storage::StorageError;
 
+/// The journal's own column: the content hash on the last row of an episode, null on the others.
+pub(super) const HASH_COLUMN: &str = "content_hash";
+
 /// A journal that is being written.
 pub(super) struct Journal {
     /// Where it is.
     pub(super) path: PathBuf,
+    /// Of the store's columns.
     schema: SchemaRef,
+    /// With the hashes.
+    own: SchemaRef,
     writer: StreamWriter<BufWriter<File>>,
 }
 
@@ -32,15 +42,24 @@ impl Journal {
     ) -> Result<Self, StorageError> {
         let path = directory.join(journal_name(part));
         let file = File::create_new(&path).map_err(IoError::os("create", &path))?;
+        let hashes = Arc::new(Field::new(HASH_COLUMN, DataType::Binary, true));
+        let fields: Vec<_> = schema.fields().iter().cloned().chain([hashes]).collect();
         let entries = Metadata::from([(MANIFEST_KEY, manifest)]);
-        let described = Schema::new_with_metadata(schema.fields().clone(), entries);
-        let writer = StreamWriter::try_new(BufWriter::with_capacity(1 << 18, file), &described);
+        let own = Arc::new(Schema::new_with_metadata(fields, entries));
+        let writer = StreamWriter::try_new(BufWriter::with_capacity(1 << 18, file), &own);
         let writer = writer.map_err(|e| refused(e, &path))?;
-        Ok(Self { path, schema: SchemaRef::clone(schema), writer })
+        let mut journal = Self { path, schema: SchemaRef::clone(schema), own, writer };
+        journal.flush()?; // its manifest has the digest of the part before, whose journal goes
+        Ok(journal)
     }
 
-    /// Appends episodes as one batch; they are safe after the next [`Journal::flush`].
-    pub(super) fn write(&mut self, layout: &Layout, episodes: &[Episode]) -> Result<(), StorageError> {
+    /// Appends episodes, with their content hashes, as one batch; they are safe after the next [`Journal::flush`].
+    pub(super) fn write(
+        &mut self,
+        layout: &Layout,
+        episodes: &[Episode],
+        hashes: &[[u8; 32]],
+    ) -> Result<(), StorageError> {
         if episodes.is_empty() {
             return Ok(()); // a batch of no rows has no lists
         }
@@ -48,7 +67,16 @@ impl Journal {
         for episode in episodes {
             block.push(layout, episode);
         }
-        let written = block.into_batch(&self.schema).and_then(|batch| self.writer.write(&batch));
+        let written = block.into_batch(&self.schema).and_then(|batch| {
+            let hashes: BinaryArray = episodes
+                .iter()
+                .zip(hashes)
+                .flat_map(|(episode, hash)| std::iter::repeat_n(None, episode.steps).chain([Some(&hash[..])]))
+                .collect();
+            let mut columns = batch.columns().to_vec();
+            columns.push(Arc::new(hashes));
+            self.writer.write(&RecordBatch::try_new(SchemaRef::clone(&self.own), columns)?)
+        });
         written.map_err(|e| refused(e, &self.path))
     }
 

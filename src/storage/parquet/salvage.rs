@@ -1,58 +1,113 @@
-//! What a kill leaves of a directory or file: sealed parts, and the journal of the one that was being written.
+//! What a kill leaves of a directory or file: sealed parts, and the journals of those that were being written.
 
-use std::fs::File;
-use std::io::{BufReader, Cursor, Read};
 use std::path::{Path, PathBuf};
+use std::sync::mpsc::Receiver;
 
-use arrow::ipc::reader::StreamReader;
-use arrow::ipc::root_as_message;
-
-use super::decoder::{Decoder, guard};
+use super::decoder::Decoder;
 use super::journal::journal_name;
+use super::journal_reader::{JournalReader, Note};
 use super::sink::part_name;
+use super::source::check_file;
 use super::{MANIFEST_FILE, MANIFEST_KEY, PART_KEY, entry, footer};
 use crate::io::{self, IoError};
-use crate::schema::{Episode, Layout, Manifest};
+use crate::schema::{Episode, Layout, Manifest, Part, SchemaError};
+use crate::storage::tally::check;
 use crate::storage::{EpisodeSource, MANIFEST_LIMIT, StorageError, Tally};
 
 /// An unfinished store: its whole episodes in order, then an error that says what is wrong.
 pub(super) struct Leftover {
     directory: PathBuf,
     manifest: Manifest,
+    /// The sealed parts, as the journal after them or the manifest knows them.
+    known: Vec<Part>,
     layout: Layout,
     next_part: usize,
-    current: Option<(Decoder, PathBuf)>,
+    current: Option<Open>,
     total: Tally,
+}
+
+/// A part or a journal.
+struct Open {
+    decoder: Decoder,
+    path: PathBuf,
+    /// Of a journal: what it says beside its rows.
+    notes: Option<Receiver<Note>>,
 }
 
 impl Leftover {
     pub(super) fn open(directory: &Path) -> Result<Self, StorageError> {
-        let text = manifest_text(directory)?.ok_or_else(|| {
-            let message = "no part and no journal that can be read: nothing was committed; record again".to_owned();
-            StorageError::NotAStore { message, path: directory.to_owned() }
-        })?;
-        let schema = |source| StorageError::Schema { source, path: directory.to_owned() };
-        let manifest = Manifest::parse(&text).map_err(schema)?.unsealed();
+        let manifest = manifest(directory)?.ok_or_else(|| StorageError::Empty { path: directory.to_owned() })?;
+        let (known, manifest) = (manifest.parts.clone(), manifest.unsealed());
         let layout = manifest.layout();
         let (directory, total) = (directory.to_owned(), Tally::default());
-        Ok(Self { directory, manifest, layout, next_part: 0, current: None, total })
+        Ok(Self { directory, manifest, known, layout, next_part: 0, current: None, total })
     }
 
     /// The next part, or its journal where it was not sealed; false when there is neither.
     fn open_next(&mut self) -> Result<bool, StorageError> {
         let k = self.next_part;
-        self.next_part += 1;
         let (part, journal) = (self.directory.join(part_name(k)), self.directory.join(journal_name(k)));
-        let (decoder, path) = if part.is_file() {
-            (Decoder::open(&part, &self.layout)?, part)
-        } else if journal.is_file() {
-            let batches = read_journal(&journal)?;
-            (Decoder::journal(&journal, &self.layout, &batches.schema(), Box::new(batches))?, journal)
+        let (decoder, path, notes) = if part.is_file() && (k < self.known.len() || !journal.is_file()) {
+            self.vouch(k, &part)?;
+            (Decoder::open(&part, &self.layout)?, part, None)
+        } else if !journal.is_file() {
+            return self.end(k, "is missing").map(|()| false);
+        } else if let Some((batches, notes)) = JournalReader::open(&journal)? {
+            let schema = batches.schema();
+            (Decoder::journal(&journal, &self.layout, &schema, Box::new(batches))?, journal, Some(notes))
         } else {
-            return Ok(false);
+            return self.end(k, "holds nothing").map(|()| false);
         };
-        self.current = Some((decoder, path));
+        self.next_part += 1;
+        self.current = Some(Open { decoder, path, notes });
         Ok(true)
+    }
+
+    /// Checks a sealed part before any of its episodes is given out: its own digest, or that of its content.
+    fn vouch(&self, k: usize, path: &Path) -> Result<(), StorageError> {
+        let damaged = |message: &str| Err(StorageError::Damaged { message: message.to_owned(), path: path.to_owned() });
+        let Some(part) = self.known.get(k) else {
+            return match check_file(path) {
+                Err(StorageError::NotAStore { .. }) => damaged("nothing that is left has a digest of this part"),
+                checked => checked,
+            };
+        };
+        let (mut decoder, mut tally, mut next) =
+            (Decoder::open(path, &self.layout)?, Tally::default(), part.episodes[0]);
+        while let Some(episode) = decoder.next_episode(next)? {
+            let hash = check(&self.layout, &episode, next);
+            tally.add(&episode, &hash.map_err(|source| StorageError::Schema { source, path: path.to_owned() })?);
+            next += 1;
+        }
+        if next != part.episodes[1] || tally.content() != part.content {
+            return damaged("its episodes do not have the digest that was noted when it was sealed");
+        }
+        Ok(())
+    }
+
+    /// Part or journal `k` is the last of which anything is there; refused when a later one is.
+    fn end(&self, k: usize, what: &str) -> Result<(), StorageError> {
+        for name in [part_name(k + 1), journal_name(k + 1)] {
+            if self.directory.join(&name).exists() {
+                let message = format!("{} {what}, but {name} is there", journal_name(k));
+                return Err(StorageError::Damaged { message, path: self.directory.clone() });
+            }
+        }
+        Ok(())
+    }
+
+    /// What stands behind the last episode of the open journal.
+    fn end_of_journal(&self, notes: &Receiver<Note>, path: &Path) -> Result<(), StorageError> {
+        let damaged = |message: String| Err(StorageError::Damaged { message, path: path.to_owned() });
+        match notes.try_recv() {
+            Err(_) => Ok(()),
+            Ok(Note::Torn) => {
+                self.end(self.next_part - 1, "is cut short")?;
+                Err(StorageError::Truncated { episodes: self.total.episodes, path: path.to_owned() })
+            }
+            Ok(Note::Fault(message)) => damaged(message),
+            Ok(Note::Hash(_)) => damaged("a content hash has no episode".to_owned()),
+        }
     }
 }
 
@@ -63,86 +118,77 @@ impl EpisodeSource for Leftover {
 
     fn next_episode(&mut self) -> Result<Option<Episode>, StorageError> {
         loop {
-            let Some((decoder, path)) = &mut self.current else {
+            let Some(Open { decoder, path, notes }) = &mut self.current else {
                 if self.open_next()? {
                     continue;
                 }
                 return Ok(None);
             };
-            if let Some(episode) = decoder.next_episode(self.total.episodes)? {
+            let index = self.total.episodes;
+            if let Some(episode) = decoder.next_episode(index)? {
                 let hash = self.total.check(&self.layout, &episode);
                 let hash = hash.map_err(|source| StorageError::Schema { source, path: path.clone() })?;
+                if let Some(notes) = notes
+                    && !matches!(notes.try_recv(), Ok(Note::Hash(noted)) if noted == hash)
+                {
+                    let message = format!("episode {index} does not have the content hash that was noted with it");
+                    return Err(StorageError::Damaged { message, path: path.clone() });
+                }
                 self.total.add(&episode, &hash);
                 return Ok(Some(episode));
+            }
+            if let Some(Open { path, notes: Some(notes), .. }) = &self.current {
+                self.end_of_journal(notes, path)?;
             }
             self.current = None;
         }
     }
 }
 
-/// The manifest: that of the directory, of the first part, or of the first journal.
-fn manifest_text(directory: &Path) -> Result<Option<String>, StorageError> {
+/// The manifest: that of the directory, of the newest journal that has a whole one, or of the first part. `None` when
+/// there is none, and nothing is damaged.
+fn manifest(directory: &Path) -> Result<Option<Manifest>, StorageError> {
+    let parse = |text: &str| {
+        Manifest::parse(text).map_err(|source| StorageError::Schema { source, path: directory.to_owned() })
+    };
     let path = directory.join(MANIFEST_FILE);
     if path.is_file() {
-        return Ok(Some(io::read_text(&path, MANIFEST_LIMIT)?));
+        return parse(&io::read_text(&path, MANIFEST_LIMIT)?).map(Some);
+    }
+    let mut fault = None;
+    for journal in journals(directory)? {
+        match JournalReader::open(&journal) {
+            Ok(None) => {} // it was begun when the kill came
+            Ok(Some((reader, _))) => {
+                let text = reader.schema().metadata().get(MANIFEST_KEY).cloned().unwrap_or_default();
+                match parse(&text) {
+                    Err(error @ StorageError::Schema { source: SchemaError::Version { .. }, .. }) => return Err(error),
+                    Err(error) => fault = Some(error),
+                    manifest => return manifest.map(Some),
+                }
+            }
+            Err(error) => fault = Some(error),
+        }
     }
     let part = directory.join(part_name(0));
     if part.is_file() {
         let metadata = footer(&part)?;
-        return Ok(entry(&metadata, PART_KEY).or_else(|| entry(&metadata, MANIFEST_KEY)).map(str::to_owned));
+        let text = entry(&metadata, PART_KEY).or_else(|| entry(&metadata, MANIFEST_KEY)).unwrap_or_default();
+        return parse(text).map(Some);
     }
-    let journal = directory.join(journal_name(0));
-    if !journal.is_file() {
-        return Ok(None);
-    }
-    Ok(read_journal(&journal)?.schema().metadata().get(MANIFEST_KEY).cloned())
+    fault.map_or(Ok(None), Err)
 }
 
-/// The whole batches of a journal. A torn last batch ends them: it was never committed.
-fn read_journal(path: &Path) -> Result<StreamReader<Messages<BufReader<File>>>, StorageError> {
-    let file = File::open(path).map_err(IoError::os("open", path))?;
-    let left = file.metadata().map_err(IoError::os("read", path))?.len();
-    let messages = Messages { input: BufReader::with_capacity(1 << 18, file), left, whole: Cursor::default() };
-    guard(path, || StreamReader::try_new(messages, None))
-}
-
-/// The messages of an Arrow IPC stream, each whole; what is torn is not read. Their sizes are compared with what the
-/// file still has before memory is given to them, so that a journal cannot ask for more than it holds.
-struct Messages<R> {
-    input: R,
-    left: u64,
-    /// The message at hand.
-    whole: Cursor<Vec<u8>>,
-}
-
-impl<R: Read> Messages<R> {
-    fn take(&mut self, count: u64) -> Option<Vec<u8>> {
-        self.left = self.left.checked_sub(count)?;
-        let mut bytes = Vec::new();
-        (self.input.by_ref().take(count).read_to_end(&mut bytes).ok()? as u64 == count).then_some(bytes)
-    }
-
-    /// The next message, or `None` at the end of what is whole.
-    fn message(&mut self) -> Option<Vec<u8>> {
-        let mut message = self.take(8)?;
-        let (marker, length) = message.split_at(4);
-        let length = u32::from_le_bytes(length.try_into().ok()?);
-        if marker != [0xff; 4] || length == 0 {
-            return None; // the end of the stream, or none of ours
+/// The journals that are there, newest first.
+fn journals(directory: &Path) -> Result<Vec<PathBuf>, StorageError> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(directory).map_err(IoError::os("list", directory))? {
+        let path = entry.map_err(IoError::os("list", directory))?.path();
+        if path.extension().is_some_and(|ending| ending == "arrows") {
+            found.push(path);
         }
-        let head = self.take(u64::from(length))?;
-        let body = u64::try_from(root_as_message(&head).ok()?.bodyLength()).ok()?;
-        message.extend(head);
-        message.extend(self.take(body)?);
-        Some(message)
     }
-}
-
-impl<R: Read> Read for Messages<R> {
-    fn read(&mut self, out: &mut [u8]) -> std::io::Result<usize> {
-        if self.whole.position() == self.whole.get_ref().len() as u64 {
-            self.whole = Cursor::new(self.message().unwrap_or_default());
-        }
-        self.whole.read(out)
-    }
+    found.sort();
+    found.reverse();
+    Ok(found)
 }

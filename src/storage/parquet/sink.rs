@@ -8,11 +8,11 @@ use parquet::file::metadata::KeyValue;
 
 use super::columns::{Block, row_bytes, schema};
 use super::encoder::{Encoder, file_digest_entry};
-use super::journal::{Journal, refused};
+use super::journal::{Journal, journal_name, refused};
 use super::{MANIFEST_FILE, MANIFEST_KEY, PART_KEY, is_single};
 use crate::io::{self, IoError};
 use crate::schema::{Episode, Layout, Manifest, Part};
-use crate::storage::{EpisodeSink, StorageError, Tally, lock, start_partial};
+use crate::storage::{EpisodeSink, StorageError, Tally, lock, publish, start_partial};
 
 /// Rows that are encoded at once.
 const BLOCK_ROWS: usize = 8192;
@@ -132,15 +132,11 @@ impl ParquetSink {
         Ok(sink)
     }
 
+    /// Starts the journal of the next part; its manifest holds the content digests of the parts before.
     fn start_journal(&mut self) -> Result<(), StorageError> {
-        let manifest = self.unsealed()?;
+        let manifest = self.sealed(&Manifest { parts: self.parts.clone(), ..self.manifest.clone() })?;
         self.journal = Some(Journal::create(&self.partial, self.parts.len(), &self.schema, manifest)?);
         Ok(())
-    }
-
-    fn unsealed(&self) -> Result<String, StorageError> {
-        let unsealed = Manifest { parts: Vec::new(), ..self.manifest.clone() };
-        unsealed.sealed_json().map_err(|source| StorageError::Schema { source, path: self.path.clone() })
     }
 
     /// How many of these episodes the open part still takes.
@@ -158,23 +154,31 @@ impl ParquetSink {
         episodes.iter().take_while(fits).count()
     }
 
-    /// Ends the file that is being written.
-    fn end_part(&mut self, metadata: Vec<KeyValue>) -> Result<(), StorageError> {
+    /// Ends the file that is being written. Its journal goes when it is sealed; before that the next one has its digest.
+    /// The last journal of a directory goes when the manifest is there.
+    fn end_part(&mut self, metadata: Vec<KeyValue>, last: bool) -> Result<(), StorageError> {
         self.commit()?;
         let journal = self.journal.take().map(|journal| journal.path);
-        self.rows.end_file(&self.layout, metadata, journal)?;
         let part = std::mem::take(&mut self.part);
         let end = self.part_start + part.episodes;
         let content = part.content();
         let file = part_name(self.parts.len());
         self.parts.push(Part { file, episodes: [self.part_start, end], bytes: 0, sha256: String::new(), content });
         (self.part_start, self.part_bytes) = (end, 0);
-        Ok(())
+        if !last {
+            self.start_journal()?;
+        }
+        self.rows.end_file(&self.layout, metadata, journal.filter(|_| !last || self.single))
     }
 
-    /// Metadata of a part: where it comes from.
+    /// Metadata of a part: where it comes from, whoever wrote it.
     fn part_metadata(&self) -> Result<Vec<KeyValue>, StorageError> {
-        Ok(vec![KeyValue::new(PART_KEY.to_owned(), self.unsealed()?)])
+        let manifest = Manifest { parts: Vec::new(), task: String::new(), ..self.manifest.clone() };
+        Ok(vec![KeyValue::new(PART_KEY.to_owned(), self.sealed(&manifest)?)])
+    }
+
+    fn sealed(&self, manifest: &Manifest) -> Result<String, StorageError> {
+        manifest.sealed_json().map_err(|source| StorageError::Schema { source, path: self.path.clone() })
     }
 }
 
@@ -191,7 +195,7 @@ impl EpisodeSink for ParquetSink {
             let (now, later) = episodes.split_at(self.room(episodes));
             let (rows, journal, layout) = (&mut self.rows, &mut self.journal, &self.layout);
             // the journal takes a copy and a system call, the columns processor time
-            let journal = || journal.as_mut().map_or(Ok(()), |journal| journal.write(layout, now));
+            let journal = || journal.as_mut().map_or(Ok(()), |journal| journal.write(layout, now, hashes));
             let (journaled, encoded) = rayon::join(journal, || rows.push(layout, now));
             journaled.and(encoded)?;
             for (episode, hash) in now.iter().zip(hashes) {
@@ -204,8 +208,7 @@ impl EpisodeSink for ParquetSink {
             }
             (episodes, hashes) = (later, &hashes[now.len()..]);
             let metadata = self.part_metadata()?;
-            self.end_part(metadata)?;
-            self.start_journal()?;
+            self.end_part(metadata, false)?;
         }
     }
 
@@ -222,16 +225,16 @@ impl EpisodeSink for ParquetSink {
         let schema = |source| StorageError::Schema { source, path: path.clone() };
         if self.single {
             let text = self.manifest.sealed_json().map_err(schema)?;
-            self.end_part(vec![KeyValue::new(MANIFEST_KEY.to_owned(), text.clone()), file_digest_entry()])?;
+            self.end_part(vec![KeyValue::new(MANIFEST_KEY.to_owned(), text.clone()), file_digest_entry()], true)?;
             self.rows.encoder.join()?;
             let file = self.partial.join(part_name(0));
-            io::publish(&file, &self.path, self.force, MANIFEST_FILE)?;
+            publish(&file, &self.path, self.force)?;
             self.finished = true;
             std::fs::remove_dir_all(&self.partial).map_err(IoError::os("remove", &self.partial))?;
             return Manifest::parse(&text).map_err(schema);
         }
         let metadata = self.part_metadata()?;
-        self.end_part(metadata)?;
+        self.end_part(metadata, true)?;
         let mut parts = std::mem::take(&mut self.parts);
         for (part, sealed) in parts.iter_mut().zip(self.rows.encoder.join()?) {
             (part.bytes, part.sha256) = (sealed.bytes, sealed.sha256);
@@ -239,10 +242,11 @@ impl EpisodeSink for ParquetSink {
         self.manifest.parts = parts;
         let text = self.manifest.sealed_json().map_err(schema)?;
         io::write_atomic(&self.partial.join(MANIFEST_FILE), text.as_bytes())?;
-        lock::release(&self.partial)?;
+        io::remove(&self.partial.join(journal_name(self.manifest.parts.len() - 1)))?;
         io::sync_dir(&self.partial)?;
-        io::publish(&self.partial, &self.path, self.force, MANIFEST_FILE)?;
+        publish(&self.partial, &self.path, self.force)?;
         self.finished = true;
+        lock::release(&self.path)?; // only now: nobody takes the partial for what a kill left
         Manifest::parse(&text).map_err(schema)
     }
 }
