@@ -25,14 +25,18 @@
 //! # Differences from the reference implementation
 //! RLDS nests steps in episodes; here a step is a row with scalar keys, so that any engine can group by them.
 
+mod batch;
 mod columns;
 mod decoder;
 mod diagnose;
 mod encoder;
 mod group;
 mod journal;
+mod leaf;
+mod levels;
 mod pages;
 mod pairs;
+mod rows;
 mod salvage;
 mod side_by_side;
 mod sink;
