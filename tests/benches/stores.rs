@@ -2,7 +2,7 @@
 //! time, best of several, and bytes beside what the same rollouts take as raw f32.
 //!
 //! `cargo bench --bench stores` prints CSV. `-- --policy run:DIR` records a trained policy, `--episodes N` another number,
-//! `--repeats N` more of it; `--only WORD` leaves out what does not begin so.
+//! `--repeats N` more of it; `--only WORD` leaves out what does not begin so, `--form store.mcap` the other forms.
 #![expect(clippy::unwrap_used, clippy::print_stdout, reason = "a benchmark prints, and panics where it cannot start")]
 
 use std::path::{Path, PathBuf};
@@ -26,7 +26,7 @@ fn main() {
     };
     let episodes: u64 = option("--episodes", "16000").parse().unwrap();
     let repeats: u64 = option("--repeats", "5").parse().unwrap();
-    let only = option("--only", "");
+    let (only, form) = (option("--only", ""), option("--form", ""));
     let scenario = scenario::build(&Spec::new("simple_spread").with("agents", 3)).unwrap();
     let link = link::build(&Spec::new("perfect"), &Setting { distance_unit: scenario.link_unit() }).unwrap();
     let policy = Spec::parse("policy", POLICIES, &option("--policy", "random")).unwrap();
@@ -36,7 +36,7 @@ fn main() {
     let directory = tempfile::tempdir().unwrap();
     let steps = episodes * scenario.steps() as u64;
     println!("what,form,steps_per_wall_s,steps_per_cpu_s,wall_s,cpu_s,gb_per_wall_s,bytes,of_raw_f32");
-    for form in FORMS {
+    for form in FORMS.into_iter().filter(|&f| form.is_empty() || f == form) {
         let path = directory.path().join(form);
         let record = || {
             let mut sink = storage::create(&path, &manifest, true).unwrap();

@@ -166,6 +166,17 @@ pub(super) struct Leaf {
     begun: usize,
     /// Room for levels.
     levels: [Vec<u8>; 2],
+    /// The levels of the page before: most pages repeat them, and comparing bytes is ten times cheaper than reading them.
+    seen: Seen,
+}
+
+/// What levels were found to say.
+#[derive(Default)]
+struct Seen {
+    begun: usize,
+    count: usize,
+    bytes: Bytes,
+    rows: Option<levels::Rows>,
 }
 
 /// What is left of a page.
@@ -206,7 +217,7 @@ impl Leaf {
     ) -> Result<Self, ParquetError> {
         let (chunk, file) = (metadata.row_group(group).column(plan.column), Arc::new(file.clone()));
         let pages = SerializedPageReader::new(file, chunk, 0, None)?;
-        Ok(Self { plan, pages, page: Opened::default(), begun: 0, levels: Default::default() })
+        Ok(Self { plan, pages, page: Opened::default(), begun: 0, levels: Default::default(), seen: Seen::default() })
     }
 
     /// The next `rows` rows, as an array of the field's type.
@@ -272,24 +283,23 @@ impl Leaf {
             }
             Page::DictionaryPage { .. } => return Err("a dictionary where none was announced".to_owned()),
         };
-        let most = [u8::from(shape.list), shape.present];
-        for (i, levels) in self.levels.iter_mut().enumerate() {
-            levels.clear();
-            if most[i] > 0 {
+        let whole = rest.clone();
+        let mut inputs = [Bytes::new(), Bytes::new()];
+        for ((i, input), there) in inputs.iter_mut().enumerate().zip([shape.list, shape.present > 0]) {
+            if there {
                 let length = match lengths {
                     Some(lengths) => lengths[i] as usize,
                     None => prefix(&mut rest)?,
                 };
-                // every value has its bytes, so a page without nulls cannot describe more than it holds
-                let input = take(&mut rest, length)?;
-                if !shape.nullable && count > kind.most(rest.len()) {
-                    return Err(format!("{count} values in {} bytes", rest.len()));
-                }
-                levels::expand(&input, most[i], count, levels)?;
+                *input = take(&mut rest, length)?;
             }
         }
-        let [reps, defs] = &self.levels;
-        let (runs, values) = levels::rows(shape, (reps, defs), count, &mut self.begun)?;
+        // every value has its bytes, so a page without nulls cannot describe more than it holds
+        if !shape.nullable && count > kind.most(rest.len()) {
+            return Err(format!("{count} values in {} bytes", rest.len()));
+        }
+        let bytes = whole.slice(..whole.len() - rest.len());
+        let (runs, values) = self.rows(&inputs, bytes, count)?;
         let (mut encoding, mut length) = (Values::Plain, values * kind.bits() / 8);
         match (page.encoding(), kind) {
             (Encoding::PLAIN, Kind::Bit) => length = values.div_ceil(8),
@@ -302,6 +312,31 @@ impl Leaf {
         }
         self.page = Opened { values: rest, encoding, count: values, at: 0, runs: runs.into() };
         Ok(true)
+    }
+
+    /// The rows of a page of `count` levels, which stand in `bytes`.
+    fn rows(&mut self, inputs: &[Bytes; 2], bytes: Bytes, count: usize) -> Result<(Vec<Run>, usize), String> {
+        let seen = &self.seen;
+        if let Some(rows) = &seen.rows
+            && (seen.begun, seen.count, &seen.bytes) == (self.begun, count, &bytes)
+        {
+            self.begun = rows.begun;
+            return Ok((rows.runs.clone(), rows.values));
+        }
+        let shape = self.plan.shape;
+        let most = [u8::from(shape.list), shape.present];
+        for ((input, levels), most) in inputs.iter().zip(&mut self.levels).zip(most) {
+            levels.clear();
+            if most > 0 {
+                levels::expand(input, most, count, levels)?;
+            }
+        }
+        let rows = levels::rows(shape, [&self.levels[0], &self.levels[1]], count, self.begun)?;
+        let (begun, bytes) = (self.begun, Bytes::copy_from_slice(&bytes));
+        self.begun = rows.begun;
+        let found = (rows.runs.clone(), rows.values);
+        self.seen = Seen { begun, count, bytes, rows: Some(rows) };
+        Ok(found)
     }
 }
 
@@ -337,7 +372,7 @@ fn take(rest: &mut Bytes, length: usize) -> Result<Bytes, String> {
 }
 
 /// Appends `n` values from number `page.at` on, each of `N` bytes, that `value` makes.
-fn decode<const N: usize, T>(page: &Opened, n: usize, out: &mut Vec<T>, value: fn([u8; N]) -> T) {
+fn decode<const N: usize, T>(page: &Opened, n: usize, out: &mut Vec<T>, value: impl Fn([u8; N]) -> T) {
     let range = page.at..page.at + n;
     match page.encoding {
         Values::Plain => {
@@ -345,7 +380,7 @@ fn decode<const N: usize, T>(page: &Opened, n: usize, out: &mut Vec<T>, value: f
             out.extend(values.iter().map(|&bytes| value(bytes)));
         }
         Values::Split => {
-            let streams: [&[u8]; N] = std::array::from_fn(|i| &page.values[i * page.count..][range.clone()]);
+            let streams: [&[u8]; N] = std::array::from_fn(|i| &page.values[i * page.count..][range.clone()][..n]);
             out.extend((0..n).map(|k| value(std::array::from_fn(|i| streams[i][k]))));
         }
     }
@@ -355,8 +390,8 @@ impl Out {
     /// Appends `n` values of a page.
     fn take(&mut self, page: &Opened, n: usize) {
         match self {
-            Self::F32(out) => decode(page, n, out, f32::from_le_bytes),
-            Self::F64(out) => decode(page, n, out, f64::from_le_bytes),
+            Self::F32(out) => decode(page, n, out, |bytes| f32::from_le_bytes(bytes)),
+            Self::F64(out) => decode(page, n, out, |bytes| f64::from_le_bytes(bytes)),
             Self::Bit(out) => out.append_packed_range(page.at..page.at + n, &page.values),
         }
     }

@@ -25,6 +25,17 @@ pub(super) struct Run {
     pub(super) null: bool,
 }
 
+/// The rows of a page.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Rows {
+    /// Values and empty places, in order.
+    pub(super) runs: Vec<Run>,
+    /// Values.
+    pub(super) values: usize,
+    /// How many values of its last row the page holds, if the row goes on in the next page; else 0.
+    pub(super) begun: usize,
+}
+
 /// Expands `count` levels of up to `most` from runs and bit-packed groups (the hybrid encoding).
 pub(super) fn expand(input: &[u8], most: u8, count: usize, out: &mut Vec<u8>) -> Result<(), String> {
     out.clear();
@@ -70,53 +81,44 @@ fn varint(input: &mut &[u8]) -> Option<u64> {
     None
 }
 
-/// The rows that `count` levels describe, as runs of values and of empty places, and how many values there are. `begun` is
-/// how many values of the row at hand the pages before have held; it is moved on. `reps` and `defs` are empty where the
-/// column has none.
-pub(super) fn rows(
-    shape: Shape,
-    (reps, defs): (&[u8], &[u8]),
-    count: usize,
-    begun: &mut usize,
-) -> Result<(Vec<Run>, usize), String> {
+/// The rows that `count` levels describe. `begun` is how many values of the row at hand the pages before have held. The
+/// repetition and the definition levels are empty where the column has none.
+pub(super) fn rows(shape: Shape, [reps, defs]: [&[u8]; 2], count: usize, begun: usize) -> Result<Rows, String> {
     let width = shape.width;
+    let other = || format!("a list that does not have {width} elements");
     if !shape.nullable {
         if defs.iter().fold(false, |bad, &def| bad | (def != shape.present)) {
             return Err("a null where none may be".to_owned());
         }
-        if shape.list {
-            // the end of the row at hand, then row by row
-            let (head, whole) = reps.split_at(reps.len().min((width - *begun) % width));
-            let fault =
-                |row: &[u8]| row.first() != Some(&0) || row[1..].iter().fold(0, |n, &r| n + usize::from(r == 0)) > 0;
-            if head.contains(&0) || whole.chunks(width).any(fault) {
-                return Err(format!("a list that does not have {width} elements"));
-            }
+        // the end of the row at hand, then row by row
+        let (head, whole) = reps.split_at(reps.len().min((width - begun) % width));
+        let fits = |row: &[u8]| row[0] == 0 && row[1..].iter().fold(true, |fits, &rep| fits & (rep == 1));
+        if head.contains(&0) || !whole.chunks(width).all(fits) {
+            return Err(other());
         }
-        *begun = (*begun + count) % width;
-        return Ok((vec![Run { slots: count, null: false }], count));
+        let runs = vec![Run { slots: count, null: false }];
+        return Ok(Rows { runs, values: count, begun: (begun + count) % width });
     }
-    let (mut runs, mut values) = (Vec::new(), 0);
-    let mut add = |slots: usize, null: bool| match runs.last_mut() {
-        Some(Run { slots: last, null: same }) if *same == null => *last += slots,
-        _ => runs.push(Run { slots, null }),
-    };
+    let mut page = Rows { runs: Vec::new(), values: 0, begun };
     for i in 0..count {
         let goes_on = shape.list && reps[i] != 0;
-        if goes_on != (*begun > 0) {
-            return Err(format!("a list that does not have {width} elements"));
+        if goes_on != (page.begun > 0) {
+            return Err(other());
         }
-        if defs[i] == shape.present {
-            *begun = (*begun + 1) % width;
-            values += 1;
-            add(1, false);
-        } else if defs[i] == 0 && !goes_on {
-            add(width, true);
-        } else {
+        let null = defs[i] != shape.present;
+        if null && (defs[i] != 0 || goes_on) {
             return Err("a null or empty list where only a null row may be".to_owned());
         }
+        if !null {
+            (page.values, page.begun) = (page.values + 1, (page.begun + 1) % width);
+        }
+        let slots = if null { width } else { 1 };
+        match page.runs.last_mut() {
+            Some(run) if run.null == null => run.slots += slots,
+            _ => page.runs.push(Run { slots, null }),
+        }
     }
-    Ok((runs, values))
+    Ok(page)
 }
 
 #[cfg(test)]
@@ -156,32 +158,33 @@ mod tests {
 
     #[test]
     fn rows_may_go_on_in_the_next_page() {
-        let mut begun = 0;
-        let page = rows(LIST, (&[0, 1, 1, 0], &[1; 4]), 4, &mut begun).unwrap();
-        assert_eq!((page, begun), ((vec![Run { slots: 4, null: false }], 4), 1));
-        let page = rows(LIST, (&[1, 1], &[1; 2]), 2, &mut begun).unwrap();
-        assert_eq!((page, begun), ((vec![Run { slots: 2, null: false }], 2), 0));
-        rows(ACTION, (&[0, 1], &[2, 2]), 2, &mut begun).unwrap();
-        let page = rows(ACTION, (&[1, 0, 0], &[2, 0, 0]), 3, &mut begun).unwrap();
-        let runs = vec![Run { slots: 1, null: false }, Run { slots: 6, null: true }];
-        assert_eq!((page, begun), ((runs, 1), 0));
+        let run = |slots, null| Run { slots, null };
+        let page = rows(LIST, [&[0, 1, 1, 0], &[1; 4]], 4, 0).unwrap();
+        assert_eq!(page, Rows { runs: vec![run(4, false)], values: 4, begun: 1 });
+        let page = rows(LIST, [&[1, 1], &[1; 2]], 2, 1).unwrap();
+        assert_eq!(page, Rows { runs: vec![run(2, false)], values: 2, begun: 0 });
+        let page = rows(ACTION, [&[0, 1], &[2, 2]], 2, 0).unwrap();
+        assert_eq!(page, Rows { runs: vec![run(2, false)], values: 2, begun: 2 });
+        let page = rows(ACTION, [&[1, 0, 0, 0], &[2, 0, 0, 2]], 4, 2).unwrap();
+        assert_eq!(page, Rows { runs: vec![run(1, false), run(6, true), run(1, false)], values: 2, begun: 1 });
+        let scalar = Shape { width: 1, list: false, nullable: true, present: 1 };
+        let page = rows(scalar, [&[], &[1, 0, 1]], 3, 0).unwrap();
+        assert_eq!(page, Rows { runs: vec![run(1, false), run(1, true), run(1, false)], values: 2, begun: 0 });
     }
 
     #[test]
     fn what_is_no_list_of_this_width_is_an_error() {
-        let fault = |shape, reps: &[u8], defs: &[u8]| rows(shape, (reps, defs), defs.len(), &mut 0).unwrap_err();
+        let fault = |shape, reps: &[u8], defs: &[u8]| rows(shape, [reps, defs], defs.len(), 0).unwrap_err();
         let width = "a list that does not have 3 elements";
         for reps in [&[0, 1, 0, 0, 1, 1][..], &[0, 1, 1, 1], &[1, 1, 1], &[0, 1, 1, 1, 1, 1], &[0, 0]] {
             assert_eq!(fault(LIST, reps, &vec![1; reps.len()]), width, "{reps:?}");
             assert_eq!(fault(ACTION, reps, &vec![2; reps.len()]), width, "{reps:?}");
         }
+        assert_eq!(rows(LIST, [&[1, 0], &[1, 1]], 2, 1).unwrap_err(), width, "it began in the page before");
         assert_eq!(fault(LIST, &[0, 1, 1], &[1, 0, 1]), "a null where none may be");
         for (reps, defs) in [(&[0][..], &[1][..]), (&[0, 1, 1], &[2, 1, 2]), (&[0, 1, 1], &[2, 0, 2])] {
             assert_eq!(fault(ACTION, reps, defs), "a null or empty list where only a null row may be", "{defs:?}");
         }
         assert_eq!(fault(ACTION, &[0, 0], &[2, 0]), width, "a null row inside a list");
-        let scalar = Shape { width: 1, list: false, nullable: true, present: 1 };
-        let (runs, values) = rows(scalar, (&[], &[1, 0, 1]), 3, &mut 0).unwrap();
-        assert_eq!((runs.len(), values), (3, 2));
     }
 }
