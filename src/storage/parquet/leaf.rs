@@ -371,28 +371,37 @@ fn take(rest: &mut Bytes, length: usize) -> Result<Bytes, String> {
     Ok(rest.split_to(length))
 }
 
-/// Appends `n` values from number `page.at` on, each of `N` bytes, that `value` makes.
-fn decode<const N: usize, T>(page: &Opened, n: usize, out: &mut Vec<T>, value: impl Fn([u8; N]) -> T) {
-    let range = page.at..page.at + n;
-    match page.encoding {
-        Values::Plain => {
-            let (values, _) = page.values[range.start * N..range.end * N].as_chunks();
-            out.extend(values.iter().map(|&bytes| value(bytes)));
-        }
-        Values::Split => {
-            let streams: [&[u8]; N] = std::array::from_fn(|i| &page.values[i * page.count..][range.clone()][..n]);
-            out.extend((0..n).map(|k| value(std::array::from_fn(|i| streams[i][k]))));
-        }
+impl Opened {
+    /// The next `n` values as they stand, each of `N` bytes.
+    fn plain<const N: usize>(&self, n: usize) -> &[[u8; N]] {
+        self.values[self.at * N..(self.at + n) * N].as_chunks().0
     }
+
+    /// The bytes of the next `n` values: all their first bytes, all their second, ….
+    fn split<const N: usize>(&self, n: usize) -> [&[u8]; N] {
+        std::array::from_fn(|i| &self.values[i * self.count + self.at..][..n])
+    }
+}
+
+/// Four streams of bytes side by side; written so that the compiler makes vectors of it, which is four times faster.
+fn quads<'a>([a, b, c, d]: [&'a [u8]; 4]) -> impl Iterator<Item = [u8; 4]> + 'a {
+    a.iter().zip(b).zip(c.iter().zip(d)).map(|((&a, &b), (&c, &d))| [a, b, c, d])
 }
 
 impl Out {
     /// Appends `n` values of a page.
     fn take(&mut self, page: &Opened, n: usize) {
-        match self {
-            Self::F32(out) => decode(page, n, out, |bytes| f32::from_le_bytes(bytes)),
-            Self::F64(out) => decode(page, n, out, |bytes| f64::from_le_bytes(bytes)),
-            Self::Bit(out) => out.append_packed_range(page.at..page.at + n, &page.values),
+        match (self, page.encoding) {
+            (Self::F32(out), Values::Plain) => out.extend(page.plain(n).iter().map(|&bytes| f32::from_le_bytes(bytes))),
+            (Self::F64(out), Values::Plain) => out.extend(page.plain(n).iter().map(|&bytes| f64::from_le_bytes(bytes))),
+            (Self::F32(out), Values::Split) => out.extend(quads(page.split(n)).map(f32::from_le_bytes)),
+            (Self::F64(out), Values::Split) => {
+                let [a, b, c, d, e, f, g, h] = page.split(n);
+                let halves = quads([a, b, c, d]).zip(quads([e, f, g, h]));
+                let whole = |(low, high)| u64::from(u32::from_le_bytes(low)) | u64::from(u32::from_le_bytes(high)) << 32;
+                out.extend(halves.map(|halves| f64::from_bits(whole(halves))));
+            }
+            (Self::Bit(out), _) => out.append_packed_range(page.at..page.at + n, &page.values),
         }
     }
 
