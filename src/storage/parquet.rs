@@ -26,6 +26,7 @@
 //! # Differences from the reference implementation
 //! RLDS nests steps in episodes; here a step is a row with scalar keys, so that any engine can group by them.
 
+mod batch;
 mod columns;
 mod decoder;
 mod diagnose;
@@ -33,8 +34,11 @@ mod encoder;
 mod group;
 mod journal;
 mod journal_reader;
+mod leaf;
+mod levels;
 mod pages;
 mod pairs;
+mod rows;
 mod salvage;
 mod side_by_side;
 mod sink;

@@ -1,11 +1,14 @@
 //! Replay memory: the newest episodes, whole, in flat arrays; and the rings of delivered and lost messages.
 
+use std::ops::ControlFlow;
+
 use rand::Rng;
 
 use super::TrainError;
 use crate::algo::Batch;
 use crate::rng;
-use crate::schema::{Episode, Layout};
+use crate::schema::{AgentSpec, Episode, Layout};
+use crate::storage::{EpisodeSource, Rows};
 
 /// The newest `capacity` transitions, as whole episodes of `steps` steps. Observations are kept once per row; the row
 /// after a transition's is its successor.
@@ -19,7 +22,10 @@ pub struct Replay {
     pub pushed: u64,
     learners: Vec<usize>,
     names: Vec<String>,
+    /// Widths of a row: observations, actions, links.
     widths: [usize; 3],
+    /// Per learner, width of its observation and of its action.
+    own: [Vec<usize>; 2],
     /// `[episode, T + 1, O]`.
     pub observations: Vec<f32>,
     /// `[episode, T + 1, N²]`.
@@ -46,14 +52,16 @@ impl Replay {
         if capacity < steps || steps == 0 {
             return Err(TrainError::Store(format!("replay {capacity} holds no episode of {steps} steps")));
         }
-        let sum =
-            |width: fn(&crate::schema::AgentSpec) -> usize| learners.iter().map(|&a| width(&layout.agents[a])).sum();
+        let own =
+            |width: fn(&AgentSpec) -> usize| learners.iter().map(|&a| width(&layout.agents[a])).collect::<Vec<_>>();
+        let own = [own(|a| a.observation), own(|a| a.action)];
         Ok(Self {
             steps,
             capacity: capacity / steps,
             pushed: 0,
             names: learners.iter().map(|&a| layout.agents[a].name.clone()).collect(),
-            widths: [sum(|a| a.observation), sum(|a| a.action), learners.len() * learners.len()],
+            widths: [own[0].iter().sum(), own[1].iter().sum(), learners.len() * learners.len()],
+            own,
             learners,
             observations: Vec::new(),
             link: Vec::new(),
@@ -65,12 +73,109 @@ impl Replay {
 
     /// Transitions in memory.
     pub fn len(&self) -> usize {
-        self.reward.len()
+        self.pushed.min(self.capacity as u64) as usize * self.steps
     }
 
     /// Whether it is empty.
     pub fn is_empty(&self) -> bool {
-        self.reward.is_empty()
+        self.pushed == 0
+    }
+
+    /// Makes the arrays as long as `episodes` episodes need. Fresh memory comes from the system as zeros and is touched
+    /// only when it is filled.
+    fn resize(&mut self, episodes: usize) {
+        fn to<T: Clone + Default>(array: &mut Vec<T>, length: usize) {
+            if array.is_empty() {
+                *array = vec![T::default(); length];
+            } else {
+                array.resize(length, T::default());
+            }
+        }
+        let [o, a, l] = self.widths;
+        let (t, rows) = (episodes * self.steps, episodes * (self.steps + 1));
+        to(&mut self.observations, rows * o);
+        to(&mut self.link, rows * l);
+        to(&mut self.actions, t * a);
+        to(&mut self.reward, t);
+        to(&mut self.bonus, t);
+    }
+
+    /// Adds all episodes that are left in a store, without shaping; what [`Replay::push`] would make of them, from whole
+    /// columns. Returns how many they are.
+    ///
+    /// # Errors
+    /// As [`Replay::push`], and [`TrainError::Storage`] when the store cannot be read; the memory then holds only a part.
+    pub fn fill(&mut self, source: &mut dyn EpisodeSource) -> Result<u64, TrainError> {
+        let (before, agents) = (self.pushed, self.learners.clone());
+        let slots = |pushed: u64| pushed.min(self.capacity as u64) as usize;
+        let expected = slots(before.saturating_add(source.manifest().episodes));
+        self.resize(expected);
+        let mut refused = Ok(());
+        let read = source.read_rows(&agents, &mut |rows| {
+            refused = self.push_rows(rows);
+            if refused.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+        });
+        self.resize(self.len() / self.steps); // the store may have held less than it said
+        read?;
+        refused.map(|()| self.pushed - before)
+    }
+
+    /// Adds rows that follow those before.
+    fn push_rows(&mut self, rows: &Rows<'_>) -> Result<(), TrainError> {
+        self.check_rows(rows)?;
+        let ([o, a, l], t, period) = (self.widths, self.steps, self.steps + 1);
+        let slot = (self.pushed % self.capacity as u64) as usize;
+        let needed = slot + (rows.step + rows.count).div_ceil(period);
+        if needed.min(self.capacity) * t > self.reward.len() {
+            self.resize(needed.min(self.capacity));
+        }
+        let (mut from, mut at) = (0, slot * period + rows.step);
+        while from < rows.count {
+            // as many rows as fit before the ring begins anew
+            let n = (rows.count - from).min(self.capacity * period - at);
+            interleave(&mut self.observations[at * o..(at + n) * o], &self.own[0], &rows.observations, from);
+            self.link[at * l..(at + n) * l].copy_from_slice(&rows.link[from * l..(from + n) * l]);
+            let mut done = 0;
+            while done < n {
+                let (episode, step) = ((at + done) / period, (at + done) % period);
+                let (here, acted) = ((period - step).min(n - done), (t - step).min(n - done));
+                let (row, to) = (from + done, episode * t + step);
+                interleave(&mut self.actions[to * a..(to + acted) * a], &self.own[1], &rows.actions, row);
+                self.reward[to..to + acted].copy_from_slice(&rows.reward[row..row + acted]);
+                self.bonus[to..to + acted].fill(0.0);
+                done += here;
+            }
+            (from, at) = (from + n, 0);
+        }
+        self.pushed += rows.ends.len() as u64;
+        Ok(())
+    }
+
+    /// Every episode has T steps, and sends what it observes.
+    fn check_rows(&self, rows: &Rows<'_>) -> Result<(), TrainError> {
+        let period = self.steps + 1;
+        let ends = rows.ends.iter().enumerate();
+        let mut lengths = ends.map(|(k, &end)| (k, rows.step + end - k * period));
+        if let Some((k, steps)) = lengths.find(|&(_, steps)| steps != self.steps) {
+            return Err(self.length(rows.episode + k as u64, &steps.to_string()));
+        }
+        let whole = rows.ends.len();
+        if rows.step + rows.count - whole * period > self.steps {
+            return Err(self.length(rows.episode + whole as u64, &format!("more than {}", self.steps)));
+        }
+        for ((name, observation), message) in self.names.iter().zip(&rows.observations).zip(&rows.messages) {
+            if !std::ptr::eq(*observation, *message) && observation != message {
+                let differs = observation.iter().zip(*message).position(|(o, m)| o != m).unwrap_or(0);
+                let row = differs / (observation.len() / rows.count).max(1);
+                let episode = rows.episode + rows.ends.partition_point(|&end| end < row) as u64;
+                return Err(not_observed(episode, name));
+            }
+        }
+        Ok(())
+    }
+
+    fn length(&self, episode: u64, steps: &str) -> TrainError {
+        TrainError::Store(format!("episode {episode} has {steps} steps, the trainer needs {}", self.steps))
     }
 
     /// Adds an episode, forgetting the oldest when full. `bonus` is the shaping stored at rollout `[T]`, or empty.
@@ -79,41 +184,23 @@ impl Replay {
     /// [`TrainError::Store`] when the episode has another length, or a message is not the sender's observation.
     pub fn push(&mut self, episode: &Episode, bonus: &[f32]) -> Result<(), TrainError> {
         if episode.steps != self.steps {
-            return Err(TrainError::Store(format!(
-                "episode {} has {} steps, the trainer needs {}",
-                episode.index, episode.steps, self.steps
-            )));
+            return Err(self.length(episode.index, &episode.steps.to_string()));
         }
         for (name, &a) in self.names.iter().zip(&self.learners) {
             if episode.messages[a].data != episode.observations[a].data {
-                return Err(TrainError::Store(format!(
-                    "episode {}: message.{name} is not observation.{name}; only policies that send their observation can warm-start",
-                    episode.index
-                )));
+                return Err(not_observed(episode.index, name));
             }
         }
         let [o, a, l] = self.widths;
         let slot = (self.pushed % self.capacity as u64) as usize;
         let rows = self.steps + 1;
         if self.reward.len() <= slot * self.steps {
-            self.observations.resize((slot + 1) * rows * o, 0.0);
-            self.link.resize((slot + 1) * rows * l, false);
-            self.actions.resize((slot + 1) * self.steps * a, 0.0);
-            self.reward.resize((slot + 1) * self.steps, 0.0);
-            self.bonus.resize((slot + 1) * self.steps, 0.0);
+            self.resize(slot + 1);
         }
-        interleave(
-            &mut self.observations[slot * rows * o..(slot + 1) * rows * o],
-            o,
-            &self.learners,
-            &episode.observations,
-        );
-        interleave(
-            &mut self.actions[slot * self.steps * a..(slot + 1) * self.steps * a],
-            a,
-            &self.learners,
-            &episode.actions,
-        );
+        let [observed, acted] = [&episode.observations, &episode.actions]
+            .map(|columns| self.learners.iter().map(|&a| &columns[a].data[..]).collect::<Vec<_>>());
+        interleave(&mut self.observations[slot * rows * o..(slot + 1) * rows * o], &self.own[0], &observed, 0);
+        interleave(&mut self.actions[slot * self.steps * a..(slot + 1) * self.steps * a], &self.own[1], &acted, 0);
         self.link[slot * rows * l..(slot + 1) * rows * l].copy_from_slice(&episode.link);
         let range = slot * self.steps..(slot + 1) * self.steps;
         self.reward[range.clone()].copy_from_slice(&episode.reward);
@@ -174,15 +261,20 @@ impl Replay {
     }
 }
 
-/// Lays the learners' matrices side by side, row by row.
-fn interleave(out: &mut [f32], width: usize, learners: &[usize], columns: &[crate::schema::Matrix]) {
-    let mut at = 0;
-    for &agent in learners {
-        let column = &columns[agent];
-        for (row, out) in out.chunks_exact_mut(width).enumerate() {
-            out[at..at + column.width].copy_from_slice(column.row(row));
+fn not_observed(episode: u64, name: &str) -> TrainError {
+    TrainError::Store(format!(
+        "episode {episode}: message.{name} is not observation.{name}; only policies that send their observation can warm-start"
+    ))
+}
+
+/// Lays columns of these widths side by side, row by row, from their row `from` on until `out` is full.
+fn interleave(out: &mut [f32], widths: &[usize], columns: &[&[f32]], from: usize) {
+    let (row, mut at) = (widths.iter().sum::<usize>().max(1), 0);
+    for (column, &width) in columns.iter().zip(widths).filter(|(_, width)| **width > 0) {
+        for (out, values) in out.chunks_exact_mut(row).zip(column[from * width..].chunks_exact(width)) {
+            out[at..at + width].copy_from_slice(values);
         }
-        at += column.width;
+        at += width;
     }
 }
 

@@ -18,6 +18,9 @@ use crate::schema::{AgentSpec, Episode, Layout};
 /// Name of the elements of a list, as pyarrow and the Parquet standard write it.
 pub(super) const ELEMENT: &str = "element";
 
+/// The columns that say which row of which episode a row is; the first of every schema.
+pub(super) const KEYS: [&str; 5] = ["episode", "step", "is_first", "is_last", "is_terminal"];
+
 /// Values that the encoder takes at once; the crate's 1024 costs more calls.
 const WRITE_BATCH: usize = 1 << 16;
 
@@ -51,6 +54,19 @@ pub(super) fn schema(layout: &Layout) -> SchemaRef {
     fields.push(Field::new("reward", DataType::Float32, true));
     fields.extend(layout.agents.iter().map(|a| Field::new(format!("reward.{}", a.name), DataType::Float32, true)));
     Arc::new(Schema::new(fields))
+}
+
+/// The columns of a layout that [`Rows`](crate::storage::Rows) of these agents need.
+pub(super) fn schema_of_agents(layout: &Layout, agents: &[usize]) -> Schema {
+    let whole = schema(layout);
+    let of_agents = |name: &str| {
+        let mut kinds = ["observation.", "message.", "action."].iter();
+        let agent = kinds.find_map(|kind| name.strip_prefix(kind));
+        agent.is_some_and(|agent| agents.iter().any(|&a| layout.agents[a].name == agent))
+    };
+    let keys = KEYS.iter().chain(&["link", "reward"]);
+    let wanted = |name: &str| keys.clone().any(|&key| key == name) || of_agents(name);
+    Schema::new(whole.fields().iter().filter(|f| wanted(f.name())).map(Arc::clone).collect::<Vec<_>>())
 }
 
 fn list_type(element: DataType, width: usize) -> DataType {

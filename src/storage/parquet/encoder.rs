@@ -54,7 +54,8 @@ impl Encoder {
     /// Starts the thread; the k-th file is `name(k)` in `directory`, written as `<name>.tmp` until it is whole.
     pub(super) fn start(schema: SchemaRef, directory: &Path, name: fn(usize) -> String) -> Result<Self, StorageError> {
         let group = Group::new(SchemaRef::clone(&schema)).map_err(|e| refused(e, directory))?;
-        let (jobs, inbox) = sync_channel(2);
+        // one row group waits at most: each is a good part of what a recording takes in memory
+        let (jobs, inbox) = sync_channel(1);
         let place = directory.to_owned();
         let thread = std::thread::spawn(move || assemble(&inbox, &schema, |k| place.join(name(k))));
         Ok(Self { group, directory: directory.to_owned(), jobs: Some(jobs), thread: Some(thread) })

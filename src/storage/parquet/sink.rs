@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use arrow::datatypes::SchemaRef;
 use parquet::file::metadata::KeyValue;
 
-use super::columns::{Block, row_bytes, schema};
+use super::columns::{Block, batch_rows, row_bytes, schema};
 use super::encoder::{Encoder, file_digest_entry};
 use super::journal::{Journal, journal_name, refused};
 use super::{MANIFEST_FILE, MANIFEST_KEY, PART_KEY, is_single};
@@ -14,10 +14,10 @@ use crate::io::{self, IoError};
 use crate::schema::{Episode, Layout, Manifest, Part};
 use crate::storage::{EpisodeSink, StorageError, Tally, lock, publish, start_partial};
 
-/// Rows that are encoded at once.
-const BLOCK_ROWS: usize = 8192;
 /// Rows of a row group at most, unless one episode is longer.
 const GROUP_ROWS: usize = 1 << 17;
+/// Bytes of a row group's rows in memory at most, unless one episode is larger: until it ends it is kept, encoded.
+const GROUP_BYTES: u64 = 128 << 20;
 /// Episodes of a part at most.
 const PART_EPISODES: u64 = 4000;
 /// Bytes of a part's rows in memory at most, unless one episode is larger.
@@ -52,22 +52,30 @@ struct Rows {
     block: Block,
     /// Rows of the row group, those of the block included.
     group: usize,
+    /// Rows of a block at least, and of a row group at most; what they take in memory is bounded.
+    cuts: [usize; 2],
     encoder: Encoder,
+}
+
+/// Rows that are encoded at once, and rows of a row group.
+fn cuts(layout: &Layout) -> [usize; 2] {
+    [batch_rows(layout), GROUP_ROWS.min((GROUP_BYTES / row_bytes(layout)) as usize)]
 }
 
 impl Rows {
     /// Adds whole episodes.
     fn push(&mut self, layout: &Layout, episodes: &[Episode]) -> Result<(), StorageError> {
+        let [block_rows, group_rows] = self.cuts;
         for episode in episodes {
             let rows = episode.rows();
-            if self.group > 0 && self.group + rows > GROUP_ROWS {
+            if self.group > 0 && self.group + rows > group_rows {
                 self.end_block(layout)?;
                 self.encoder.end_group()?;
                 self.group = 0;
             }
             self.block.push(layout, episode);
             self.group += rows;
-            if self.block.rows >= BLOCK_ROWS {
+            if self.block.rows >= block_rows {
                 self.end_block(layout)?;
             }
         }
@@ -109,7 +117,8 @@ impl ParquetSink {
         let lock = lock::hold_directory(&partial)?;
         let schema = schema(&layout);
         let encoder = Encoder::start(SchemaRef::clone(&schema), &partial, part_name)?;
-        let rows = Rows { schema: SchemaRef::clone(&schema), block: Block::new(&layout, 0), group: 0, encoder };
+        let (block, cuts) = (Block::new(&layout, 0), cuts(&layout));
+        let rows = Rows { schema: SchemaRef::clone(&schema), block, group: 0, cuts, encoder };
         let mut sink = Self {
             path: path.to_owned(),
             partial,

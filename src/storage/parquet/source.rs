@@ -12,10 +12,12 @@ use sha2::{Digest as _, Sha256};
 use super::columns::batch_rows;
 use super::decoder::{Decoder, guard};
 use super::pages::{PageFault, check_pages};
+use super::rows::read;
 use super::{FILE_SHA256_KEY, MANIFEST_FILE, MANIFEST_KEY, PART_KEY, entry, find_file_digest, footer};
 use crate::io::{self, IoError};
 use crate::schema::{Episode, Layout, Manifest, Part, SELF_SHA256_PLACEHOLDER, SchemaError, hex};
-use crate::storage::{EpisodeSource, MANIFEST_LIMIT, StorageError, Tally};
+use crate::storage::rows::by_episode;
+use crate::storage::{EpisodeSource, MANIFEST_LIMIT, StorageError, Take, Tally};
 
 /// An episode, and its content hash or what is wrong with it.
 type Checked = (Episode, Result<[u8; 32], SchemaError>);
@@ -117,10 +119,10 @@ impl Parts {
         })
     }
 
-    /// Checks the digest of the next part and opens it; false when there is none.
-    fn open_part(&mut self) -> Result<bool, StorageError> {
+    /// Checks the digest of the next part, while that of the one after is begun; `None` when there is none.
+    fn next_part(&mut self) -> Result<Option<PathBuf>, StorageError> {
         let Some(part) = self.manifest.parts.get(self.next_part) else {
-            return Ok(false);
+            return Ok(None);
         };
         let path = self.directory.join(&part.file);
         let begun = self.digest.take().filter(|(number, _)| *number == self.next_part);
@@ -128,12 +130,18 @@ impl Parts {
             let made = begun.and_then(|(_, thread)| thread.join().ok());
             made.unwrap_or_else(|| io::sha256_file(&path))
         })?;
-        self.current = Some((Ahead::open(&path, &self.layout)?, Tally::default()));
         self.next_part += 1;
         self.digest = self.manifest.parts.get(self.next_part).map(|next| {
             let path = self.directory.join(&next.file);
             (self.next_part, std::thread::spawn(move || io::sha256_file(&path)))
         });
+        Ok(Some(path))
+    }
+
+    /// Opens the next part; false when there is none.
+    fn open_part(&mut self) -> Result<bool, StorageError> {
+        let Some(path) = self.next_part()? else { return Ok(false) };
+        self.current = Some((Ahead::open(&path, &self.layout)?, Tally::default()));
         Ok(true)
     }
 }
@@ -141,6 +149,24 @@ impl Parts {
 impl EpisodeSource for Parts {
     fn manifest(&self) -> &Manifest {
         &self.manifest
+    }
+
+    fn read_rows(&mut self, agents: &[usize], take: &mut Take<'_>) -> Result<(), StorageError> {
+        if self.current.is_some() {
+            return by_episode(self, agents, take); // the part at hand has been begun by episodes
+        }
+        while let Some(path) = self.next_part()? {
+            let [from, to] = self.manifest.parts[self.next_part - 1].episodes;
+            if read(&path, &self.layout, agents, &mut self.total, take)?.is_break() {
+                return Ok(());
+            }
+            if self.total.episodes != to {
+                let found = self.total.episodes.saturating_sub(from);
+                let message = format!("expected {} episodes, found {found}", to - from);
+                return Err(StorageError::Damaged { message, path });
+            }
+        }
+        self.total.compare(&self.manifest, &self.directory)
     }
 
     fn skip_to(&mut self, episode: u64) -> Result<(), StorageError> {
@@ -213,6 +239,17 @@ impl Single {
 impl EpisodeSource for Single {
     fn manifest(&self) -> &Manifest {
         &self.manifest
+    }
+
+    fn read_rows(&mut self, agents: &[usize], take: &mut Take<'_>) -> Result<(), StorageError> {
+        if self.total.episodes > 0 {
+            return by_episode(self, agents, take);
+        }
+        self.decoder = None;
+        if read(&self.path, &self.layout, agents, &mut self.total, take)?.is_break() {
+            return Ok(());
+        }
+        self.total.compare(&self.manifest, &self.path)
     }
 
     fn next_episode(&mut self) -> Result<Option<Episode>, StorageError> {
