@@ -243,7 +243,7 @@ mod tests {
         let chain = Chain::fit(&runs, 2);
         assert_eq!((chain.first, chain.lost.clone()), (0.0, vec![0.5, 0.5]));
         assert_eq!(chain.matrix(), [[0.5, 0.5], [0.5, 0.5]]);
-        let three = Chain { first: 0.0, lost: vec![0.1, 0.4, 0.7], floor: 0.0 };
+        let three = Chain { first: 0.0, lost: vec![0.1, 0.4, 0.7], floor: 1e-15 };
         assert_eq!(three.matrix(), [[0.9, 0.1, 0.0], [0.6, 0.0, 0.4], [1.0 - 0.7, 0.0, 0.7]]);
         let expected = 2.0 * 0.9_f64.ln() + 0.1_f64.ln() + 0.4_f64.ln() + (1.0 - 0.7_f64).ln();
         let mut longer = Runs::default();

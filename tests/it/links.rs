@@ -139,7 +139,8 @@ proptest! {
     }
 }
 
-fn record(scenario: &dyn scenario::Scenario, link: &dyn Link, episodes: u64, seed: u64, out: &Path) {
+/// Records a random policy into a store.
+pub(crate) fn record(scenario: &dyn scenario::Scenario, link: &dyn Link, episodes: u64, seed: u64, out: &Path) {
     let policy = build_policy(&Spec::new("random"), scenario).unwrap();
     let recording = Recording { scenario, link, policy: &*policy, seed, episodes };
     let mut sink = storage::create(out, &recording.manifest(), false).unwrap();

@@ -3,6 +3,7 @@
 
 mod allocations;
 mod architecture;
+mod channel;
 mod cli;
 mod estimate_mi;
 mod extracts;
