@@ -14,7 +14,7 @@ use ccmarl::stats::{ChiSquare, homogeneity};
 use ccmarl::{scenario, storage};
 use serde_json::Value;
 
-use crate::links::record;
+use crate::links::{classifier, record};
 
 const MEDIUM: [f64; 6] = [0.94, 0.60, 0.71, 0.87, 0.97, 0.99];
 const HEAVY: [f64; 8] = [0.90, 0.81, 0.45, 0.61, 0.37, 0.77, 0.89, 0.93];
@@ -102,7 +102,7 @@ fn what_was_simulated_is_found_again() {
     ] {
         let found = recovery(link, model, 8, 120);
         assert_eq!((found.right, found.covered), (8, 8), "{link}: {found:?}");
-        assert!(model == "markov" || found.worst < 0.02, "{link}: {found:?}");
+        assert!(model != "distance" || found.worst < 0.02, "{link}: {found:?}");
         assert!(model != "markov" || found.parameters[0] >= 5, "{link}: {found:?}");
     }
 }
@@ -202,14 +202,30 @@ fn a_classifier_does_what_its_data_did() {
 #[test]
 fn auto_takes_a_classifier_where_the_state_decides_softly() {
     let dir = tempfile::tempdir().unwrap();
-    // half of the episodes reach 2 units, half 5: no threshold, and bursts that the distance explains
-    let path = store(dir.path(), "soft", "mixture:distance:2,distance:5", 300, 3);
+    let path = store(dir.path(), "soft", &classifier().to_string(), 300, 3);
     let (observations, fit) = fitted(&path, "auto", 1);
     let scored = fit.compared.iter().filter(|c| matches!(c.outcome, FitOutcome::Scored { .. })).count();
-    assert_eq!(scored, 4, "{:?}", fit.compared);
-    assert!(fit.model == "learned" || fit.model == "markov", "{}", fit.model);
-    let distance = ccmarl::channel::fit(&observations, "distance", 1, &|_, _| ()).unwrap();
-    assert!(distance.notes.iter().any(|note| note.contains("contradict every threshold")), "{:?}", distance.notes);
+    assert_eq!((fit.model, scored), ("learned", 4), "{:?}", fit.compared);
+    assert!(fit.held_out.calibration_error.value < 0.02, "{:?}", fit.held_out);
+    let range = ccmarl::channel::fit(&observations, "distance", 1, &|_, _| ()).unwrap();
+    assert!(range.notes.iter().any(|note| note.contains("contradict every threshold")), "{:?}", range.notes);
+    assert!(
+        range.parameters[0].low < range.parameters[0].value && range.parameters[0].value < range.parameters[0].high
+    );
+    let chain = ccmarl::channel::fit(
+        &Observations::read(&store(dir.path(), "even", "dropout:0.3", 50, 1)).unwrap(),
+        "markov",
+        1,
+        &|_, _| (),
+    );
+    let error = chain.unwrap_err().to_string();
+    assert!(
+        error.starts_with("no burst chain is earned: on held-out episodes it predicts ")
+            && error.contains("fit dropout instead"),
+        "{error}"
+    );
+    let bursts = fitted(&store(dir.path(), "bursts", "markov:heavy", 100, 1), "dropout", 1).1;
+    assert!(bursts.notes.iter().any(|note| note.starts_with("losses come in bursts")), "{:?}", bursts.notes);
 }
 
 #[test]
@@ -298,4 +314,35 @@ fn report() {
         println!("{}", out.lines().last().unwrap());
     }
     std::fs::write(dir.join("bursts.csv"), out).unwrap();
+
+    let temporary = tempfile::tempdir().unwrap();
+    let mut out = "link,episodes,seed,lost,balanced_accuracy,calibration_error,curves_apart\n".to_owned();
+    for (link, seed) in ["distance:3", "distance:5"].iter().flat_map(|link| (0..10).map(move |seed| (*link, seed))) {
+        let path = store(temporary.path(), &format!("{link}-{seed}"), link, 1000, seed);
+        let (_, fit) = fitted(&path, "learned", seed);
+        let truth = Spec::parse("link", LINKS, link).unwrap();
+        let apart = curves_apart(&simulated(&link_of(&fit), 1000, 99), &simulated(&truth, 1000, 99), 50);
+        let (held, lost) = (&fit.held_out, fit.lost as f64 / fit.messages as f64);
+        let [balanced, calibration] = [held.balanced_accuracy.unwrap().value, held.calibration_error.value];
+        writeln!(out, "{link},1000,{seed},{lost:.4},{balanced:.4},{calibration:.4},{apart:.4}").unwrap();
+        println!("{}", out.lines().last().unwrap());
+        if link == "distance:3" && seed == 0 {
+            draw(&dir.join("learned-reliability.svg"), "reliability", &fit.reliability());
+        }
+    }
+    std::fs::write(dir.join("learned.csv"), out).unwrap();
+
+    let heavy = simulated(&Spec::new("markov").with("level", "heavy"), 1000, 1);
+    let data = heavy.figures("markov:heavy on simple_spread, 1000 episodes");
+    draw(&dir.join("heavy-loss-by-step.svg"), "loss-by-step", &data);
+    draw(&dir.join("heavy-burst-lengths.svg"), "burst-lengths", &data);
+    let range = simulated(&Spec::new("distance").with("threshold", 3), 1000, 1);
+    let data = range.figures("distance:3 on simple_spread, 1000 episodes");
+    draw(&dir.join("range-loss-by-distance.svg"), "loss-by-distance", &data);
+}
+
+fn draw(path: &Path, name: &str, data: &ccmarl::figure::Data) {
+    let entry = ccmarl::registry::find("figure", ccmarl::figure::FIGURES, name).unwrap();
+    std::fs::write(path, ccmarl::figure::svg(entry, data).unwrap()).unwrap();
+    ccmarl::figure::png(entry, data, Path::new(&format!("/tmp/ch/{name}.png"))).unwrap(); // TEMPORARY
 }

@@ -35,7 +35,7 @@ fn files() -> tempfile::TempDir {
 }
 
 /// A classifier that loses more the farther apart and the faster a pair is.
-fn classifier() -> Value {
+pub(crate) fn classifier() -> Value {
     json!({"name": "learned", "features": FEATURES, "body_fields": ["x", "y", "vx", "vy"], "temperature": 1.5,
         "mean": [0.0, 0.0, 1.0, 0.0, 0.0], "scale": [1.0, 1.0, 0.8, 1.0, 1.0],
         "layers": [{"weight": [[0.1, -0.2, 2.0, 0.5, 0.5], [0.3, 0.1, -1.0, 0.2, 0.0]], "bias": [0.1, 0.2]},

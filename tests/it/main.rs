@@ -10,6 +10,7 @@ mod extracts;
 mod figures;
 mod fuzz;
 mod integrity;
+mod link_commands;
 mod links;
 mod mi;
 mod record;
