@@ -1,5 +1,6 @@
 //! The crate's error: one enum per room, wrapped here, and the exit code each deserves.
 
+use crate::channel::ChannelError;
 use crate::io::IoError;
 use crate::mi::MiError;
 use crate::pairs::PairsError;
@@ -37,6 +38,9 @@ pub enum Error {
     /// A store.
     #[error(transparent)]
     Storage(#[from] StorageError),
+    /// Fitting a link.
+    #[error(transparent)]
+    Channel(#[from] ChannelError),
     /// Training and evaluation.
     #[error(transparent)]
     Train(#[from] TrainError),
@@ -51,11 +55,15 @@ impl Error {
         let exists = |e: &IoError| matches!(e, IoError::Exists(_));
         match self {
             Self::Pairs(error) => error.is_usage(),
-            Self::Registry(e) | Self::Train(TrainError::Registry(e)) => !matches!(e, RegistryError::Data(_)),
+            Self::Registry(e) | Self::Train(TrainError::Registry(e)) | Self::Channel(ChannelError::Registry(e)) => {
+                !matches!(e, RegistryError::Data(_))
+            }
             Self::Usage(_)
-            | Self::Record(RecordError::NoEpisodes)
+            | Self::Record(RecordError::NoEpisodes | RecordError::LinkEnds { .. })
             | Self::Report(ReportError::NoInput)
-            | Self::Train(TrainError::Config { .. } | TrainError::Value { .. }) => true,
+            | Self::Train(
+                TrainError::Config { .. } | TrainError::Value { .. } | TrainError::Record(RecordError::LinkEnds { .. }),
+            ) => true,
             Self::Storage(error) | Self::Train(TrainError::Storage(error)) => error.is_usage(),
             Self::Io(e) | Self::Report(ReportError::Io(e)) | Self::Train(TrainError::Io(e)) => exists(e),
             _ => false,

@@ -5,6 +5,7 @@
 //! its own; ARCHITECTURE.md draws the house and a test holds it.
 
 pub mod algo;
+pub mod channel;
 pub mod cli;
 pub mod error;
 pub mod figure;

@@ -1,6 +1,6 @@
 //! Plugins: a const slice of entries per kind, and the way a user names one.
 //!
-//! A plugin is written `name` or `name:value` on the command line and `{ name = …, … }` in TOML and JSON. Everything
+//! A plugin is written `name`, `name:value` or as a JSON table on the command line, and `{ name = …, … }` in TOML and JSON. Everything
 //! that knows plugins (help, `list`, "did you mean", contract tests) derives from the slices.
 
 use serde::de::DeserializeOwned;
@@ -80,11 +80,18 @@ impl Spec {
         self
     }
 
-    /// Reads `name` or `name:value` against a registry.
+    /// Reads `name`, `name:value` or a JSON table `{"name": …, …}` against a registry.
     ///
     /// # Errors
-    /// [`RegistryError::Unknown`] with the nearest names, [`RegistryError::NoValue`].
+    /// [`RegistryError::Unknown`] with the nearest names, [`RegistryError::NoValue`], [`RegistryError::Params`] for what
+    /// begins like a table and is none.
     pub fn parse<B>(kind: &'static str, entries: &[Entry<B>], text: &str) -> Result<Self, RegistryError> {
+        if text.trim_start().starts_with('{') {
+            let table: Self = serde_json::from_str(text)
+                .map_err(|e| Self::new(kind).invalid(format!("expected a table {{\"name\": …, …}} in JSON: {e}")))?;
+            find(kind, entries, &table.name)?;
+            return Ok(table);
+        }
         let (name, value) = text.split_once(':').map_or((text, None), |(n, v)| (n, Some(v)));
         let entry = find(kind, entries, name)?;
         let mut spec = Self::new(entry.name);
@@ -177,9 +184,12 @@ impl Spec {
 }
 
 impl std::fmt::Display for Spec {
-    /// `name`, or `name:value` when the one parameter is a scalar, else `name{…}`.
+    /// `name`, or `name:value` when the one parameter is a scalar, `name:path` for what is read from a file, else `name{…}`.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(&self.name)?;
+        if let Some(Value::String(path)) = self.params.get("path") {
+            return write!(f, ":{path}");
+        }
         let mut values = self.params.iter().filter(|(_, v)| !v.is_null());
         match (values.next(), values.next()) {
             (None, _) => Ok(()),
@@ -266,6 +276,21 @@ mod tests {
         assert_eq!(spec.to_string(), "dropout:0.2");
         assert_eq!(serde_json::to_string(&spec).unwrap(), r#"{"name":"dropout","p":0.2}"#);
         assert_eq!(serde_json::from_str::<Spec>(r#"{"name":"dropout","p":0.2}"#).unwrap(), spec);
+    }
+
+    #[test]
+    fn a_table_is_read_too_and_a_path_stands_for_its_file() {
+        let table = r#"{"name":"dropout","p":0.2,"more":[1]}"#;
+        let spec = Spec::parse("link", KIND, table).unwrap();
+        assert_eq!(spec, Spec::new("dropout").with("p", 0.2).with("more", vec![1]));
+        let error = |text: &str| Spec::parse("link", KIND, text).unwrap_err().to_string();
+        assert!(
+            error("{\"p\":1}").starts_with("link: expected a table {\"name\": …, …} in JSON: a plugin table needs")
+        );
+        assert!(error("{").contains("EOF"), "{}", error("{"));
+        assert!(error(r#"{"name":"dropuot"}"#).contains("did you mean dropout?"));
+        let file = Spec::new("file").with("path", "a/link.json").with("link", spec.params);
+        assert_eq!(file.to_string(), "file:a/link.json");
     }
 
     #[test]

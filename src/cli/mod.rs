@@ -5,8 +5,10 @@ mod args;
 mod convert;
 mod estimate_mi;
 mod evaluate;
+mod fit_link;
 mod generate;
 mod inspect;
+mod link;
 mod list;
 mod pairs;
 mod quickstart;
@@ -56,6 +58,10 @@ enum Command {
     Pairs(pairs::Args),
     /// Estimate how much messages and actions, or any columns, tell about each other
     EstimateMi(estimate_mi::Args),
+    /// Fit a link to recorded link bits: which model explains them, with intervals
+    FitLink(fit_link::Args),
+    /// Show what a link does
+    Link(link::Args),
     /// Train a team over a link prior
     Train(train::Args),
     /// Test a trained team on every channel of a suite
@@ -110,6 +116,8 @@ fn dispatch(command: Command) -> anyhow::Result<Outcome> {
         Command::Convert(args) => convert::run(&args),
         Command::Pairs(args) => pairs::run(&args),
         Command::EstimateMi(args) => estimate_mi::run(&args),
+        Command::FitLink(args) => fit_link::run(&args),
+        Command::Link(args) => link::run(&args),
         Command::Train(args) => train::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Report(args) => report::run(&args),

@@ -7,11 +7,11 @@ use serde_json::json;
 
 use super::args::{ScenarioArgs, stop_flag};
 use super::{Outcome, ui};
-use crate::link::{LINKS, Setting};
+use crate::link::LINKS;
 use crate::record::{Options, POLICIES, RecordError, Recording, loss_rate};
 use crate::registry::{RegistryError, Spec};
 use crate::schema::Episode;
-use crate::{Error, link, record, scenario, storage};
+use crate::{Error, record, scenario, storage};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -80,8 +80,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     });
     let scenario = scenario::build(&spec.map_err(Error::from)?).map_err(Error::from)?;
     let link_spec = Spec::parse("link", LINKS, &args.link).map_err(Error::from)?;
-    let setting = Setting { distance_unit: scenario.link_unit() };
-    let link = link::build(&link_spec, &setting).map_err(Error::from)?;
+    let link = record::build_link(&link_spec, &*scenario).map_err(Error::from)?;
     let mut policy_spec = Spec::parse("policy", POLICIES, &args.policy).map_err(Error::from)?;
     if let Some(sigma) = args.action_noise {
         policy_spec = policy_spec.with("action_noise", sigma);
@@ -92,6 +91,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if args.episodes == 0 {
         return Err(Error::from(RecordError::NoEpisodes).into());
     }
+    record::check_link(&*link, args.episodes).map_err(Error::from)?;
     let stop = stop_flag()?;
     let options = storage::Options { force: args.force, viewer: !args.no_viewer };
     let mut sink = storage::create_with(&args.out, &recording.manifest(), options).map_err(Error::from)?;

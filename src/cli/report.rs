@@ -6,8 +6,7 @@ use clap::Args;
 
 use crate::cli::Outcome;
 use crate::cli::ui::{self, Format};
-use crate::link::{self, Setting};
-use crate::record::{Recording, build_policy, returns};
+use crate::record::{Recording, build_link, build_policy, returns};
 use crate::registry::Spec;
 use crate::report::{Collected, Reference, Request, Summary, collect, write};
 use crate::scenario;
@@ -67,7 +66,7 @@ fn references(collected: &Collected) -> Vec<Reference> {
     for (task, spec) in collected.tasks() {
         let play = |policy: &str| -> Result<Vec<f64>, crate::Error> {
             let scenario = scenario::build(&spec)?;
-            let link = link::build(&Spec::new("none"), &Setting { distance_unit: scenario.link_unit() })?;
+            let link = build_link(&Spec::new("none"), scenario.as_ref())?;
             let policy = build_policy(&Spec::new(policy), scenario.as_ref())?;
             let recording = Recording {
                 scenario: scenario.as_ref(),

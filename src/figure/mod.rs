@@ -3,9 +3,14 @@
 //! A figure takes from [`Data`] what it needs and leaves the rest; equal data give equal bytes. Adding one: write
 //! `figure/<name>.rs` with an `ENTRY`, and add `mod <name>;` and `<name>::ENTRY,` below.
 
+mod burst_lengths;
 mod channel_returns;
 mod learning_curves;
+mod lines;
+mod loss_by_distance;
+mod loss_by_step;
 mod mi_heatmap;
+mod reliability;
 mod scaling;
 mod style;
 
@@ -14,8 +19,16 @@ use std::path::{Path, PathBuf};
 use crate::registry::Entry;
 
 /// All figures.
-pub const FIGURES: &[Entry<Render>] =
-    &[learning_curves::ENTRY, channel_returns::ENTRY, mi_heatmap::ENTRY, scaling::ENTRY];
+pub const FIGURES: &[Entry<Render>] = &[
+    learning_curves::ENTRY,
+    channel_returns::ENTRY,
+    mi_heatmap::ENTRY,
+    scaling::ENTRY,
+    reliability::ENTRY,
+    loss_by_step::ENTRY,
+    burst_lengths::ENTRY,
+    loss_by_distance::ENTRY,
+];
 
 /// Draws a figure from `data` onto a target.
 pub type Render = fn(&Data, Target<'_>) -> Result<(), FigureError>;
@@ -44,6 +57,14 @@ pub struct Data {
     pub curves: Vec<Curve>,
     /// Costs by size, each the `step` of its point.
     pub costs: Vec<Curve>,
+    /// Observed by predicted loss probability, each the `step` of its point.
+    pub reliability: Vec<Curve>,
+    /// Loss by step of the episode.
+    pub loss_by_step: Vec<Curve>,
+    /// Share of bursts by their length, each the `step` of its point.
+    pub bursts: Vec<Curve>,
+    /// Loss by distance, world units, each the `step` of its point.
+    pub loss_by_distance: Vec<Curve>,
     /// Bars by group and series.
     pub bars: Vec<Bar>,
     /// Horizontal lines of constant value (random policy, oracle).
@@ -181,6 +202,10 @@ mod tests {
             receiver: "agent_1".to_owned(),
             value,
         };
+        let shares = || {
+            let point = |x: f64| Point { step: x, value: 0.5 * x, band: Some((0.4 * x, 0.6 * x)) };
+            vec![Curve { series: "<b>&\u{1}".to_owned(), points: vec![point(0.1), point(0.6), point(0.9)] }]
+        };
         Data {
             title: "a < b".to_owned(),
             subtitle: "± over seeds".to_owned(),
@@ -194,6 +219,10 @@ mod tests {
                     Point { step: 100.0, value: 9.0, band: None },
                 ],
             }],
+            reliability: shares(),
+            loss_by_step: shares(),
+            bursts: shares(),
+            loss_by_distance: shares(),
             bars: vec![bar("unrestricted", -80.0), bar("none", -120.0)],
             references: vec![Reference { label: "random".to_owned(), value: -200.0 }],
             cells: vec![cell("delivered", 0.4133), cell("lost", f64::NAN)],
@@ -228,6 +257,10 @@ mod tests {
                 "figure channel-returns: expected at least one bar, found none",
                 "figure mi-heatmap: expected at least one cell with a value, found none",
                 "figure scaling: expected at least one cost with points, found none",
+                "figure reliability: expected at least one bin with messages, found none",
+                "figure loss-by-step: expected at least one step with messages, found none",
+                "figure burst-lengths: expected at least one burst, found none",
+                "figure loss-by-distance: expected at least one bin of distance with messages, found none",
             ]
         );
     }

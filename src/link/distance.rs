@@ -24,7 +24,7 @@
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use super::{Build, Link, LinkEpisode, Setting, for_each_link};
+use super::{Body, Build, Link, LinkEpisode, Setting, for_each_link};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
 
@@ -64,7 +64,7 @@ impl Link for Distance {
         crate::registry::resolved(ENTRY.name, self)
     }
 
-    fn start(&self, _n: usize, _seeds: &Seeds) -> Box<dyn LinkEpisode> {
+    fn start(&self, _n: usize, _episode: u64, _seeds: &Seeds) -> Box<dyn LinkEpisode> {
         let range = self.threshold * self.unit;
         Box::new(Range { squared: range * range })
     }
@@ -75,11 +75,11 @@ struct Range {
 }
 
 impl LinkEpisode for Range {
-    fn emit(&mut self, positions: &[[f64; 2]], bits: &mut [bool]) {
-        let n = positions.len();
+    fn emit(&mut self, bodies: &[Body], bits: &mut [bool]) {
+        let n = bodies.len();
         bits.fill(true);
         for_each_link(n, |s, r, _| {
-            let (dx, dy) = (positions[s][0] - positions[r][0], positions[s][1] - positions[r][1]);
+            let (dx, dy) = (bodies[s][0] - bodies[r][0], bodies[s][1] - bodies[r][1]);
             bits[s * n + r] = dx * dx + dy * dy <= self.squared;
         });
     }
@@ -88,11 +88,11 @@ impl LinkEpisode for Range {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::link::emit_rows;
+    use crate::link::{emit_rows, test_setting};
 
     #[test]
     fn range_is_threshold_times_unit_and_the_boundary_is_inside() {
-        let setting = Setting { distance_unit: 0.25 };
+        let setting = test_setting(0.25);
         for (spec, reach) in [
             (Spec::new("distance").with("threshold", 4), 1.0),
             (Spec::new("distance").with("threshold", 7.9), 1.0),
@@ -108,7 +108,7 @@ mod tests {
 
     #[test]
     fn negative_thresholds_and_units_are_refused() {
-        let setting = Setting { distance_unit: 0.25 };
+        let setting = test_setting(0.25);
         let error = |spec: Spec| build(&spec, &setting).err().unwrap().to_string();
         assert_eq!(
             error(Spec::new("distance").with("threshold", -1)),

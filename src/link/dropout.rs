@@ -22,7 +22,7 @@
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use super::{Build, Link, LinkEpisode, for_each_link};
+use super::{Body, Build, Link, LinkEpisode, for_each_link};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::{Seeds, Stream, bernoulli};
 
@@ -52,7 +52,7 @@ impl Link for Dropout {
         crate::registry::resolved(ENTRY.name, self)
     }
 
-    fn start(&self, n: usize, seeds: &Seeds) -> Box<dyn LinkEpisode> {
+    fn start(&self, n: usize, _episode: u64, seeds: &Seeds) -> Box<dyn LinkEpisode> {
         Box::new(Episode { p: self.p, n, streams: super::streams(n, seeds) })
     }
 }
@@ -64,7 +64,7 @@ struct Episode {
 }
 
 impl LinkEpisode for Episode {
-    fn emit(&mut self, _positions: &[[f64; 2]], bits: &mut [bool]) {
+    fn emit(&mut self, _bodies: &[Body], bits: &mut [bool]) {
         let n = self.n;
         bits.fill(true);
         for_each_link(n, |s, r, link| bits[s * n + r] = !bernoulli(&mut self.streams[link], self.p));
@@ -74,10 +74,10 @@ impl LinkEpisode for Episode {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::link::{Setting, emit_rows};
+    use crate::link::{emit_rows, test_setting};
 
     fn link(p: f64) -> Result<Box<dyn Link>, RegistryError> {
-        build(&Spec::new("dropout").with("p", p), &Setting { distance_unit: 1.0 })
+        build(&Spec::new("dropout").with("p", p), &test_setting(1.0))
     }
 
     #[test]
@@ -103,7 +103,7 @@ mod tests {
             let error = link(p).err().unwrap().to_string();
             assert_eq!(error, format!("dropout: p must be in [0, 1], found {p}"));
         }
-        let missing = build(&Spec::new("dropout"), &Setting { distance_unit: 1.0 }).err().unwrap().to_string();
+        let missing = build(&Spec::new("dropout"), &test_setting(1.0)).err().unwrap().to_string();
         assert_eq!(missing, "dropout: missing field `p`");
     }
 }

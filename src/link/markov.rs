@@ -3,7 +3,7 @@
 //!
 //! # Definition
 //! State 0 delivers, every other state loses. A chain starts in state 0 at the start of an episode and emits before it
-//! moves, so that the first message always arrives. In the named levels, state s goes back to 0 with probability `p_s`,
+//! moves, so that the first message always arrives (with `start` it starts in a state drawn from there). In the named levels, state s goes back to 0 with probability `p_s`,
 //! else on to s + 1 (the last one stays): light p = .99 .85 .91; medium .94 .60 .71 .87 .97 .99; heavy .90 .81 .45 .61
 //! .37 .77 .89 .93.
 //!
@@ -11,7 +11,8 @@
 //! Bits `[N, N]`; the matrix is `[K, K]`, rows are the states left, and each sums to 1.
 //!
 //! # Parameters
-//! `level`: light, medium or heavy (`markov:heavy`), or `matrix`: up to 64 states. The manifest records both.
+//! `level`: light, medium or heavy (`markov:heavy`), or `matrix`: up to 64 states; the manifest records both. `start`:
+//! probability of each state at the start of an episode; state 0 when absent.
 //!
 //! # When it fails
 //! Short episodes from a delivering start lose less than the stationary chain: 1.10, 7.97 and 11.40 % over 25 steps.
@@ -22,10 +23,12 @@
 //! # Differences from the reference implementation
 //! A lost message reaches the receiver as zeros; TMC keeps the last one that arrived.
 
+use std::sync::Arc;
+
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use super::{Build, Link, LinkEpisode, for_each_link};
+use super::{Body, Build, Link, LinkEpisode, for_each_link};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::{Seeds, Stream, uniform};
 
@@ -75,12 +78,13 @@ impl Level {
 struct Params {
     level: Option<Level>,
     matrix: Option<Vec<Vec<f64>>>,
+    start: Option<Vec<f64>>,
 }
 
 struct Markov {
     params: Params,
-    /// Row-wise cumulative probabilities, `[K · K]`.
-    cumulative: Vec<f64>,
+    /// Row-major cumulative sums of the matrix, then of `start`, if there is one.
+    cumulative: Arc<[f64]>,
     states: usize,
 }
 
@@ -97,44 +101,63 @@ fn build(spec: &Spec, _setting: &super::Setting) -> Result<Box<dyn Link>, Regist
     if !(1..=MAX_STATES).contains(&states) {
         return Err(spec.invalid(format!("matrix must have 1 to {MAX_STATES} rows, found {states}")));
     }
-    let mut cumulative = Vec::with_capacity(states * states);
+    let mut cumulative = Vec::with_capacity((states + 1) * states);
     for (s, row) in matrix.iter().enumerate() {
         if row.len() != states {
             return Err(spec.invalid(format!("matrix must be square: row {s} has {} of {states} entries", row.len())));
         }
-        if let Some(bad) = row.iter().find(|p| !(0.0..=1.0).contains(*p)) {
-            return Err(spec.invalid(format!("matrix row {s}: probabilities must be in [0, 1], found {bad}")));
-        }
-        let mut sum = 0.0;
-        for p in row {
-            sum += p;
-            cumulative.push(sum);
-        }
-        if (sum - 1.0).abs() > 1e-9 {
-            return Err(spec.invalid(format!("matrix row {s} must sum to 1, found {sum}")));
-        }
+        accumulate(spec, &format!("matrix row {s}"), row, &mut cumulative)?;
     }
-    Ok(Box::new(Markov { params: Params { level: given.level, matrix: Some(matrix) }, cumulative, states }))
+    if let Some(start) = &given.start {
+        if start.len() != states {
+            return Err(spec.invalid(format!("start must have {states} entries, as the matrix, found {}", start.len())));
+        }
+        accumulate(spec, "start", start, &mut cumulative)?;
+    }
+    let params = Params { level: given.level, matrix: Some(matrix), start: given.start };
+    Ok(Box::new(Markov { params, cumulative: cumulative.into(), states }))
+}
+
+/// Appends the cumulative sums of a distribution over the states.
+fn accumulate(spec: &Spec, what: &str, row: &[f64], out: &mut Vec<f64>) -> Result<(), RegistryError> {
+    if let Some(bad) = row.iter().find(|p| !(0.0..=1.0).contains(*p)) {
+        return Err(spec.invalid(format!("{what}: probabilities must be in [0, 1], found {bad}")));
+    }
+    let mut sum = 0.0;
+    for p in row {
+        sum += p;
+        out.push(sum);
+    }
+    if (sum - 1.0).abs() > 1e-9 {
+        return Err(spec.invalid(format!("{what} must sum to 1, found {sum}")));
+    }
+    Ok(())
 }
 
 impl Link for Markov {
     fn parameters(&self) -> Map<String, Value> {
         let mut map = crate::registry::resolved(ENTRY.name, &self.params);
-        if self.params.level.is_none() {
-            map.shift_remove("level");
-        }
+        map.retain(|_, value| !value.is_null());
         map
     }
 
-    fn start(&self, n: usize, seeds: &Seeds) -> Box<dyn LinkEpisode> {
-        let streams = super::streams(n, seeds);
-        let chains = vec![0; streams.len()];
-        Box::new(Episode { cumulative: self.cumulative.clone(), states: self.states, n, chains, streams })
+    fn start(&self, n: usize, _episode: u64, seeds: &Seeds) -> Box<dyn LinkEpisode> {
+        let mut streams = super::streams(n, seeds);
+        let first =
+            |stream| self.params.start.as_ref().map_or(0, |_| draw(&self.cumulative, self.states, self.states, stream));
+        let chains = streams.iter_mut().map(first).collect();
+        Box::new(Episode { cumulative: Arc::clone(&self.cumulative), states: self.states, n, chains, streams })
     }
 }
 
+/// Draws a state from row `row` of the cumulative sums.
+fn draw(cumulative: &[f64], states: usize, row: usize, stream: &mut Stream) -> usize {
+    let draw = uniform(stream, 0.0, 1.0);
+    cumulative[row * states..(row + 1) * states].iter().position(|&c| draw < c).unwrap_or(states - 1)
+}
+
 struct Episode {
-    cumulative: Vec<f64>,
+    cumulative: Arc<[f64]>,
     states: usize,
     n: usize,
     chains: Vec<usize>,
@@ -142,15 +165,13 @@ struct Episode {
 }
 
 impl LinkEpisode for Episode {
-    fn emit(&mut self, _positions: &[[f64; 2]], bits: &mut [bool]) {
-        let (n, k) = (self.n, self.states);
+    fn emit(&mut self, _bodies: &[Body], bits: &mut [bool]) {
+        let n = self.n;
         bits.fill(true);
         for_each_link(n, |s, r, link| {
             let state = &mut self.chains[link];
             bits[s * n + r] = *state == 0;
-            let row = &self.cumulative[*state * k..(*state + 1) * k];
-            let draw = uniform(&mut self.streams[link], 0.0, 1.0);
-            *state = row.iter().position(|&c| draw < c).unwrap_or(k - 1);
+            *state = draw(&self.cumulative, self.states, *state, &mut self.streams[link]);
         });
     }
 }
@@ -158,9 +179,7 @@ impl LinkEpisode for Episode {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::link::{Setting, emit_rows};
-
-    const SETTING: Setting = Setting { distance_unit: 1.0 };
+    use crate::link::{emit_rows, test_setting};
 
     /// Mean loss over `steps` steps from state 0, by propagating the distribution.
     fn expected(level: Level, steps: usize) -> f64 {
@@ -181,7 +200,7 @@ mod tests {
             [(Level::Light, "light", 0.0110), (Level::Medium, "medium", 0.0797), (Level::Heavy, "heavy", 0.1140)]
         {
             assert!((expected(level, 25) - loss).abs() < 6e-5, "{name}: {}", expected(level, 25));
-            let link = build(&Spec::new("markov").with("level", name), &SETTING).unwrap();
+            let link = build(&Spec::new("markov").with("level", name), &test_setting(1.0)).unwrap();
             let (mut lost, episodes) = (0, 3000);
             for episode in 0..episodes {
                 let rows = emit_rows(&*link, 3, 25, episode);
@@ -198,13 +217,25 @@ mod tests {
     #[test]
     fn a_given_matrix_is_walked() {
         let spec: Spec = serde_json::from_str(r#"{"name":"markov","matrix":[[0,1],[1,0]]}"#).unwrap();
-        let rows = emit_rows(&*build(&spec, &SETTING).unwrap(), 2, 6, 0);
+        let rows = emit_rows(&*build(&spec, &test_setting(1.0)).unwrap(), 2, 6, 0);
         assert!(rows.iter().enumerate().all(|(t, bits)| bits[1] == (t % 2 == 0)));
     }
 
     #[test]
+    fn a_chain_may_start_anywhere() {
+        let spec: Spec =
+            serde_json::from_str(r#"{"name":"markov","matrix":[[0,1],[1,0]],"start":[0.25,0.75]}"#).unwrap();
+        let link = build(&spec, &test_setting(1.0)).unwrap();
+        let lost = (0..4000).filter(|&e| !emit_rows(&*link, 2, 2, e)[0][1]).count() as f64 / 4000.0;
+        assert!((lost - 0.75).abs() < 0.035, "{lost}"); // 5 standard errors
+        let rows = emit_rows(&*link, 2, 6, 7);
+        assert!(rows.windows(2).all(|w| w[0][1] != w[1][1]), "and goes on as the matrix says");
+    }
+
+    #[test]
     fn malformed_chains_are_refused() {
-        let error = |json: &str| build(&serde_json::from_str(json).unwrap(), &SETTING).err().unwrap().to_string();
+        let error =
+            |json: &str| build(&serde_json::from_str(json).unwrap(), &test_setting(1.0)).err().unwrap().to_string();
         assert_eq!(
             error(r#"{"name":"markov","matrix":[[0.5,0.4],[1,0]]}"#),
             "markov: matrix row 0 must sum to 1, found 0.9"
@@ -221,5 +252,13 @@ mod tests {
         assert!(error(r#"{"name":"markov"}"#).contains("give a level"));
         assert!(error(r#"{"name":"markov","level":"light","matrix":[[1]]}"#).contains("disagree"));
         assert!(error(r#"{"name":"markov","matrix":[]}"#).contains("1 to 64 rows"));
+        assert_eq!(
+            error(r#"{"name":"markov","level":"light","start":[1]}"#),
+            "markov: start must have 3 entries, as the matrix, found 1"
+        );
+        assert_eq!(
+            error(r#"{"name":"markov","matrix":[[1,0],[1,0]],"start":[0.5,0.2]}"#),
+            "markov: start must sum to 1, found 0.7"
+        );
     }
 }

@@ -6,26 +6,69 @@
 
 mod distance;
 mod dropout;
+mod file;
+mod learned;
 mod markov;
+mod mixture;
 mod none;
 mod perfect;
 mod suite;
+mod trace;
+
+use std::path::Path;
 
 use serde_json::{Map, Value};
 
+pub use file::{FITTED_KIND, FITTED_LIMIT};
+pub use learned::{Classifier, Dense, FEATURES, features};
 pub use suite::{Channel, SUITES, channel, suite};
+pub use trace::Trace;
 
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::{Seeds, Stream};
 
 /// All links.
-pub const LINKS: &[Entry<Build>] = &[perfect::ENTRY, none::ENTRY, dropout::ENTRY, markov::ENTRY, distance::ENTRY];
+pub const LINKS: &[Entry<Build>] = &[
+    perfect::ENTRY,
+    none::ENTRY,
+    dropout::ENTRY,
+    markov::ENTRY,
+    distance::ENTRY,
+    mixture::ENTRY,
+    trace::ENTRY,
+    learned::ENTRY,
+    file::ENTRY,
+];
+
+/// Links within links that are followed: a `file` may name itself.
+const MAX_DEPTH: u8 = 4;
+
+/// Reads recorded link bits; a room above gives it, since links know no files of ours.
+pub type ReadTrace = fn(&Path) -> Result<Trace, RegistryError>;
 
 /// What a link may want to know about the scenario it is used in.
 #[derive(Clone, Debug)]
 pub struct Setting {
     /// World units of one unit of distance, where the user gave none.
     pub distance_unit: f64,
+    /// Names of the communicators, in order; empty: unknown, and not checked.
+    pub communicators: Vec<String>,
+    /// Fields of a communicator's own state, `x y vx vy …`; empty: unknown, and not checked.
+    pub body_fields: Vec<String>,
+    /// Steps of an episode; 0: unknown, and not checked.
+    pub steps: usize,
+    /// How recorded link bits are read.
+    pub read_trace: ReadTrace,
+    /// How many links this one stands in.
+    depth: u8,
+}
+
+impl Setting {
+    /// A setting of which no more is known than the unit of distance, world units.
+    pub fn new(distance_unit: f64, read_trace: ReadTrace) -> Self {
+        let (communicators, body_fields) = (Vec::new(), Vec::new());
+        Self { distance_unit, communicators, body_fields, steps: 0, read_trace, depth: 0 }
+    }
 }
 
 /// Builds a link from its checked parameters.
@@ -34,25 +77,44 @@ pub type Build = fn(&Spec, &Setting) -> Result<Box<dyn Link>, RegistryError>;
 /// Builds the link that `spec` names.
 ///
 /// # Errors
-/// [`RegistryError`] for an unknown name or a parameter out of its range.
+/// [`RegistryError`] for an unknown name, a parameter out of its range, a file that cannot be used, or a link that does
+/// not fit the setting.
 pub fn build(spec: &Spec, setting: &Setting) -> Result<Box<dyn Link>, RegistryError> {
     (crate::registry::find("link", LINKS, &spec.name)?.build)(spec, setting)
 }
+
+/// Builds a link that stands within another one.
+fn build_inner(outer: &Spec, inner: &Spec, setting: &Setting) -> Result<Box<dyn Link>, RegistryError> {
+    if setting.depth >= MAX_DEPTH {
+        return Err(
+            outer.invalid(format!("links stand more than {MAX_DEPTH} deep within each other: name them directly"))
+        );
+    }
+    build(inner, &Setting { depth: setting.depth + 1, ..setting.clone() })
+}
+
+/// A body as links see it: position `[x, y]` in world units, then velocity in world units per second.
+pub type Body = [f64; 4];
 
 /// A link prior or test channel.
 pub trait Link: Send + Sync {
     /// Every parameter, resolved: what the manifest records, and what [`build`] accepts again.
     fn parameters(&self) -> Map<String, Value>;
 
-    /// The links of one episode among `n` communicators; `seeds` is the episode's own node of the seed tree.
-    fn start(&self, n: usize, seeds: &Seeds) -> Box<dyn LinkEpisode>;
+    /// The links of episode number `episode` among `n` communicators; `seeds` is the episode's own node of the seed tree.
+    fn start(&self, n: usize, episode: u64, seeds: &Seeds) -> Box<dyn LinkEpisode>;
+
+    /// How many episodes it has, if they end (a trace): whoever plays more must refuse beforehand.
+    fn episodes(&self) -> Option<u64> {
+        None
+    }
 }
 
 /// The links of one episode, called once per row (T + 1 times), in order.
 pub trait LinkEpisode: Send {
     /// Writes the link bits `[sender][receiver]` of the next row, diagonal included (always true).
-    /// `positions` are the communicators' at the time of sending, world units.
-    fn emit(&mut self, positions: &[[f64; 2]], bits: &mut [bool]);
+    /// `bodies` are the communicators' at the time of sending.
+    fn emit(&mut self, bodies: &[Body], bits: &mut [bool]);
 }
 
 /// Calls `f(sender, receiver, link index)` for every directed link among `n`, in row-major order.
@@ -78,14 +140,20 @@ fn streams(n: usize, seeds: &Seeds) -> Vec<Stream> {
     streams
 }
 
+/// A setting for tests, in which no trace can be read.
+#[cfg(test)]
+fn test_setting(distance_unit: f64) -> Setting {
+    Setting::new(distance_unit, |path| Err(RegistryError::Data(format!("no traces here: {}", path.display()))))
+}
+
 /// The bits of `rows` rows of one episode of a link, for tests.
 #[cfg(test)]
 fn emit_rows(link: &dyn Link, n: usize, rows: usize, episode: u64) -> Vec<Vec<bool>> {
-    let mut state = link.start(n, &Seeds::new(1).indexed("episode", episode));
-    let positions: Vec<[f64; 2]> = (0..n).map(|i| [i as f64, 0.0]).collect();
+    let mut state = link.start(n, episode, &Seeds::new(1).indexed("episode", episode));
+    let bodies: Vec<Body> = (0..n).map(|i| [i as f64, 0.0, 0.0, 0.0]).collect();
     let emit = |_| {
         let mut bits = vec![false; n * n];
-        state.emit(&positions, &mut bits);
+        state.emit(&bodies, &mut bits);
         assert!((0..n).all(|i| bits[i * n + i]), "the diagonal is true");
         bits
     };

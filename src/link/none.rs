@@ -22,7 +22,7 @@
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use super::{Build, Link, LinkEpisode};
+use super::{Body, Build, Link, LinkEpisode};
 use crate::registry::Entry;
 use crate::rng::Seeds;
 
@@ -48,13 +48,13 @@ impl Link for Silent {
         crate::registry::resolved(ENTRY.name, self)
     }
 
-    fn start(&self, n: usize, _seeds: &Seeds) -> Box<dyn LinkEpisode> {
+    fn start(&self, n: usize, _episode: u64, _seeds: &Seeds) -> Box<dyn LinkEpisode> {
         Box::new(Diagonal { n })
     }
 }
 
 impl LinkEpisode for Diagonal {
-    fn emit(&mut self, _positions: &[[f64; 2]], bits: &mut [bool]) {
+    fn emit(&mut self, _bodies: &[Body], bits: &mut [bool]) {
         bits.fill(false);
         bits.iter_mut().step_by(self.n + 1).for_each(|own| *own = true);
     }

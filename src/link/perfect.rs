@@ -22,7 +22,7 @@
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use super::{Build, Link, LinkEpisode};
+use super::{Body, Build, Link, LinkEpisode};
 use crate::registry::Entry;
 use crate::rng::Seeds;
 
@@ -44,13 +44,13 @@ impl Link for Perfect {
         crate::registry::resolved(ENTRY.name, self)
     }
 
-    fn start(&self, _n: usize, _seeds: &Seeds) -> Box<dyn LinkEpisode> {
+    fn start(&self, _n: usize, _episode: u64, _seeds: &Seeds) -> Box<dyn LinkEpisode> {
         Box::new(*self)
     }
 }
 
 impl LinkEpisode for Perfect {
-    fn emit(&mut self, _positions: &[[f64; 2]], bits: &mut [bool]) {
+    fn emit(&mut self, _bodies: &[Body], bits: &mut [bool]) {
         bits.fill(true);
     }
 }

@@ -54,14 +54,14 @@ pub fn channel(id: &str) -> Result<Channel, RegistryError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::link::{Setting, build};
+    use crate::link::{build, test_setting};
 
     #[test]
     fn the_papers_suite_builds_and_is_found_by_id() {
         let channels = suite("paper").unwrap();
         assert_eq!(channels.len(), 8);
         for c in &channels {
-            build(&c.spec, &Setting { distance_unit: 0.25 }).unwrap();
+            build(&c.spec, &test_setting(0.25)).unwrap();
             assert_eq!(channel(c.id).unwrap(), *c);
         }
         assert_eq!(channels[4].spec, Spec::new("distance").with("threshold", 5));

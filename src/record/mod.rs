@@ -6,13 +6,16 @@ mod resimulate;
 mod rollout;
 mod run;
 mod scripted;
+mod trace;
 
 use serde_json::{Map, Value};
 
 pub use resimulate::{Difference, FLOAT_TOLERANCE, Resimulation, STATE_TOLERANCE, scenario_of};
 pub use rollout::{EpisodeReturn, Options, Recorded, Recording, loss_rate, returns};
 pub use run::{ActionNoise, Trained};
+pub use trace::{is_link_table, read_trace};
 
+use crate::link::{self, Link, Setting};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
 use crate::scenario::Scenario;
@@ -37,6 +40,16 @@ pub enum RecordError {
     /// The store's columns, states or actions are not those of its scenario.
     #[error("the store does not fit the scenario that its manifest names: {0}")]
     Mismatch(String),
+    /// A link that ends before the recording does.
+    #[error(
+        "the trace behind the link holds {found} episodes, and {needed} are asked for: ask for {found} or fewer, or set its `cycle` to start again"
+    )]
+    LinkEnds {
+        /// Episodes it has.
+        found: u64,
+        /// Episodes asked for.
+        needed: u64,
+    },
     /// The operating system gave no threads.
     #[error("could not start {threads} threads: {reason}: give fewer with --threads")]
     Threads {
@@ -56,6 +69,36 @@ pub type Build = fn(&Spec, &dyn Scenario) -> Result<Box<dyn Policy>, RegistryErr
 /// [`RegistryError`] for an unknown name, a parameter out of its range, or a run that does not fit the scenario.
 pub fn build_policy(spec: &Spec, scenario: &dyn Scenario) -> Result<Box<dyn Policy>, RegistryError> {
     (crate::registry::find("policy", POLICIES, &spec.name)?.build)(spec, scenario)
+}
+
+/// What a link may want to know about a scenario.
+pub fn link_setting(scenario: &dyn Scenario) -> Setting {
+    let layout = scenario.layout();
+    let names: Vec<String> = layout.communicators().iter().map(|&a| layout.agents[a].name.clone()).collect();
+    let body_fields = names.first().map(|name| layout.body_fields(name)).unwrap_or_default();
+    let mut setting = Setting::new(scenario.link_unit(), read_trace);
+    (setting.communicators, setting.body_fields, setting.steps) = (names, body_fields, scenario.steps());
+    setting
+}
+
+/// Builds a link for a scenario.
+///
+/// # Errors
+/// [`RegistryError`] for an unknown name, a parameter out of its range, a file that cannot be used, or a link that does
+/// not fit the scenario.
+pub fn build_link(spec: &Spec, scenario: &dyn Scenario) -> Result<Box<dyn Link>, RegistryError> {
+    link::build(spec, &link_setting(scenario))
+}
+
+/// Refuses to play more episodes than the link has.
+///
+/// # Errors
+/// [`RecordError::LinkEnds`].
+pub fn check_link(link: &dyn Link, needed: u64) -> Result<(), RecordError> {
+    match link.episodes() {
+        Some(found) if found < needed => Err(RecordError::LinkEnds { found, needed }),
+        _ => Ok(()),
+    }
 }
 
 /// Chooses messages and actions of the agents under policy control.

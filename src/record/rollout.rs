@@ -89,21 +89,23 @@ impl Recording<'_> {
         let mut rewards = vec![0.0; agents.len()];
         let communicators = layout.communicators();
         let mut link = vec![true; communicators.len() * communicators.len()];
-        let mut positions = vec![[0.0; 2]; communicators.len()];
+        let mut bodies = vec![[0.0; 4]; communicators.len()];
 
         let (mut state, mut scratch) = (vec![0.0; scenario.shape().width()], Scratch::default());
         scenario.reset(&mut state, &mut seeds.stream("world"));
         let mut rule = seeds.stream("scripted");
-        let mut links = self.link.start(communicators.len(), &seeds.child("link"));
+        let mut links = self.link.start(communicators.len(), index, &seeds.child("link"));
         let mut policy = self.policy.start(scenario, &seeds.child("policy"));
         let mut episode = Episode::with_capacity(layout, index, steps);
         for t in 0..=steps {
             scenario.observe(&state, &mut observations);
             policy.send(&observations, &mut messages);
-            for (position, &agent) in positions.iter_mut().zip(&communicators) {
-                *position = scenario.shape().world(&state).position(agent);
+            let world = scenario.shape().world(&state);
+            for (body, &agent) in bodies.iter_mut().zip(&communicators) {
+                let ([x, y], [vx, vy]) = (world.position(agent), world.velocity(agent));
+                *body = [x, y, vx, vy];
             }
-            links.emit(&positions, &mut link);
+            links.emit(&bodies, &mut link);
             episode.state.extend_from_slice(&state);
             append(&mut episode.observations, &observations);
             append(&mut episode.messages, &messages);
@@ -128,7 +130,8 @@ impl Recording<'_> {
     /// turns true the recording ends after the block at hand.
     ///
     /// # Errors
-    /// [`RecordError::NoEpisodes`], [`RecordError::Storage`] when the sink refuses, [`RecordError::Threads`].
+    /// [`RecordError::NoEpisodes`], [`RecordError::LinkEnds`], [`RecordError::Storage`] when the sink refuses,
+    /// [`RecordError::Threads`].
     pub fn record(
         &self,
         sink: &mut dyn EpisodeSink,
@@ -139,6 +142,7 @@ impl Recording<'_> {
         if self.episodes == 0 {
             return Err(RecordError::NoEpisodes);
         }
+        super::check_link(self.link, self.episodes)?;
         let threads = options.threads;
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads)

@@ -68,6 +68,12 @@ impl Layout {
         c.iter().flat_map(|&s| c.iter().filter(move |&&r| r != s).map(move |&r| (s, r))).collect()
     }
 
+    /// Names of the state fields of agent `name`, without its name: `x y vx vy`.
+    pub fn body_fields(&self, name: &str) -> Vec<String> {
+        let own = |field: &String| Some(field.strip_prefix(name)?.strip_prefix('.')?.to_owned());
+        self.state_fields.iter().filter_map(own).collect()
+    }
+
     /// Checks names and widths.
     ///
     /// # Errors

@@ -4,9 +4,11 @@
 
 mod bootstrap;
 mod exact;
+mod proportion;
 
 pub use bootstrap::{bootstrap_interval, stratified_interval};
 pub use exact::ExactSum;
+pub use proportion::{ChiSquare, clopper_pearson, homogeneity};
 
 use statrs::distribution::{ContinuousCDF as _, StudentsT};
 

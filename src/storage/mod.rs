@@ -29,8 +29,8 @@ pub use lock::Owner;
 pub use names::refuse_within_store;
 pub use recover::{Recovered, recover};
 pub use rescue::{Rescued, rescue};
-pub use verify::{Problem, Report, Watch, ranges, verify};
 pub use rows::{Rows, Take};
+pub use verify::{Problem, Report, Watch, ranges, verify};
 
 /// All formats, in the order in which a path is offered to them; the last takes what none claims.
 pub const FORMATS: &[Entry<Format>] = &[mcap::ENTRY, parquet::ENTRY];

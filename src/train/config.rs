@@ -204,8 +204,7 @@ impl TrainConfig {
             return Err(TrainError::Value { name: "scenario.discrete".to_owned(), message });
         }
         let prior = self.prior.take().unwrap_or(preset.prior);
-        let setting = crate::link::Setting { distance_unit: scenario.link_unit() };
-        self.prior = Some(resolved(crate::link::build(&prior, &setting)?.parameters()));
+        self.prior = Some(resolved(crate::record::build_link(&prior, scenario.as_ref())?.parameters()));
         let tag = self.scenario.name == "simple_tag";
         let [alpha, beta] = if preset.shaped { [0.01, if tag { 0.001 } else { 0.01 }] } else { [0.0, 0.0] };
         let learners = scenario.agents().iter().filter(|a| a.learner).count();

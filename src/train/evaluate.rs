@@ -6,7 +6,7 @@ use polars::prelude::Column;
 
 use super::config::TrainConfig;
 use super::{TrainError, metrics};
-use crate::link::{self, Setting};
+use crate::link;
 use crate::record::{self, Recording, returns};
 use crate::registry::Spec;
 use crate::rng::Seeds;
@@ -33,7 +33,8 @@ pub struct EvaluationRow {
 /// seed meet the same episodes. `progress` is told of each finished channel.
 ///
 /// # Errors
-/// [`TrainError::Registry`] when policy, scenario or a channel cannot be built.
+/// [`TrainError::Registry`] when policy, scenario or a channel cannot be built, [`TrainError::Record`] when a channel's
+/// trace is too short.
 pub fn evaluate(
     config: &TrainConfig,
     policy: &Spec,
@@ -43,11 +44,11 @@ pub fn evaluate(
 ) -> Result<Vec<EvaluationRow>, TrainError> {
     let scenario = scenario::build(&config.scenario)?;
     let policy = record::build_policy(policy, scenario.as_ref())?;
-    let setting = Setting { distance_unit: scenario.link_unit() };
     let seed = Seeds::new(config.seed).child("evaluate").seed();
     let mut rows = Vec::new();
     for channel in channels {
-        let link = link::build(&channel.spec, &setting)?;
+        let link = record::build_link(&channel.spec, scenario.as_ref())?;
+        record::check_link(link.as_ref(), episodes)?;
         let recording =
             Recording { scenario: scenario.as_ref(), link: link.as_ref(), policy: policy.as_ref(), seed, episodes };
         rows.extend(returns(&recording, 0, episodes).into_iter().enumerate().map(|(i, r)| EvaluationRow {

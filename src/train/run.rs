@@ -9,9 +9,9 @@ use super::metrics::{self, Means, MetricsRow};
 use super::replay::{Replay, Ring};
 use super::{TrainError, checkpoint};
 use crate::algo::{Batch, Maddpg, MaddpgConfig};
-use crate::link::{self, Link, Setting};
+use crate::link::Link;
 use crate::nn::Activation;
-use crate::record::{ActionNoise, Recording, Trained, loss_rate};
+use crate::record::{ActionNoise, Recording, Trained, build_link, check_link, loss_rate};
 use crate::rng::Seeds;
 use crate::scenario::{self, Scenario};
 use crate::schema::{Episode, Layout, Manifest};
@@ -92,15 +92,16 @@ impl Trainer {
     /// A run at its start. `config` must be resolved; `dir` is where checkpoints go.
     ///
     /// # Errors
-    /// [`TrainError`] for a scenario without messages between learners, or what candle refuses.
+    /// [`TrainError`] for a scenario without messages between learners, a prior whose trace is too short, or what candle
+    /// refuses.
     pub fn new(config: TrainConfig, dir: &Path) -> Result<Self, TrainError> {
         let scenario = scenario::build(&config.scenario)?;
-        let setting = Setting { distance_unit: scenario.link_unit() };
         let prior = config.prior.as_ref().ok_or_else(|| TrainError::Value {
             name: "prior".to_owned(),
             message: "the configuration is not resolved".to_owned(),
         })?;
-        let prior = link::build(prior, &setting)?;
+        let prior = build_link(prior, scenario.as_ref())?;
+        check_link(prior.as_ref(), config.steps.div_ceil(scenario.steps() as u64))?;
         let layout = scenario.layout();
         let seeds = Seeds::new(config.seed).child("train");
         let learners: Vec<_> = layout.agents.iter().filter(|a| a.learner).collect();

@@ -3,7 +3,6 @@
 
 use std::path::Path;
 
-use ccmarl::link::{self, Setting};
 use ccmarl::record::{self, Recording};
 use ccmarl::registry::Spec;
 use ccmarl::scenario;
@@ -15,8 +14,7 @@ fn episodes(c: &mut Criterion) {
     group.throughput(Throughput::Elements(25));
     for name in ["simple_spread", "simple_reference", "simple_adversary", "simple_tag"] {
         let scenario = scenario::build(&Spec::new(name)).unwrap();
-        let setting = Setting { distance_unit: scenario.link_unit() };
-        let link = link::build(&Spec::new("dropout").with("p", 0.2), &setting).unwrap();
+        let link = record::build_link(&Spec::new("dropout").with("p", 0.2), scenario.as_ref()).unwrap();
         let policy = record::build_policy(&Spec::new("random"), scenario.as_ref()).unwrap();
         let recording = Recording {
             scenario: scenario.as_ref(),

@@ -9,7 +9,7 @@ const FLOORS: &[&[&str]] = &[
     &["nn", "stats"],
     &["algo", "scenario", "link", "storage", "figure"],
     &["record", "pairs", "mi"],
-    &["report", "train", "diagnose"],
+    &["report", "train", "channel", "diagnose"],
     &["cli", "main", "lib"],
 ];
 

@@ -36,6 +36,11 @@ fn data() -> Data {
             }
         }
     }
+    let share = |series: &&str| Curve {
+        series: (*series).to_owned(),
+        points: (1..9).map(|k| f64::from(k) / 9.0).map(|x| Point { step: x, value: x * x, band: None }).collect(),
+    };
+    let shares: Vec<Curve> = series.iter().map(share).collect();
     Data {
         title: "Return by test channel on simple_spread, 3 agents".to_owned(),
         subtitle: "one seed: ± one standard deviation over episodes, not a comparison".to_owned(),
@@ -46,6 +51,10 @@ fn data() -> Data {
             series: series[0].to_owned(),
             points: [3.0, 100.0].map(|n| Point { step: n, value: n * n, band: None }).to_vec(),
         }],
+        reliability: shares.clone(),
+        loss_by_step: shares.clone(),
+        bursts: shares.clone(),
+        loss_by_distance: shares,
         bars: ["unrestricted", "mbc-light", "dbc-heavy", "none"]
             .iter()
             .flat_map(|c| [bar(c, "fc-maddpg", -139.0), bar(c, "cc-maddpg", -129.0)])

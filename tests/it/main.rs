@@ -3,6 +3,7 @@
 
 mod allocations;
 mod architecture;
+mod channel;
 mod cli;
 mod estimate_mi;
 mod extracts;
@@ -10,6 +11,7 @@ mod figures;
 mod forged;
 mod fuzz;
 mod integrity;
+mod link_commands;
 mod links;
 mod mi;
 mod record;

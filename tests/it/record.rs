@@ -4,8 +4,8 @@ use std::io::{BufRead as _, BufReader};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use assert_cmd::Command;
-use ccmarl::link::{self, LINKS, Link, Setting};
-use ccmarl::record::{Options, POLICIES, Policy, RecordError, Recording, build_policy};
+use ccmarl::link::{LINKS, Link};
+use ccmarl::record::{Options, POLICIES, Policy, RecordError, Recording, build_link, build_policy};
 use ccmarl::registry::Spec;
 use ccmarl::scenario::{self, SCENARIOS, Scenario, Scratch};
 use ccmarl::schema::{Episode, Manifest};
@@ -41,8 +41,7 @@ struct Parts(Box<dyn Scenario>, Box<dyn Link>, Box<dyn Policy>);
 impl Parts {
     fn new(scenario: &str, agents: usize, link: &str, policy: &str) -> Self {
         let scenario = scenario::build(&Spec::new(scenario).with("agents", agents)).unwrap();
-        let setting = Setting { distance_unit: scenario.link_unit() };
-        let link = link::build(&Spec::parse("link", LINKS, link).unwrap(), &setting).unwrap();
+        let link = build_link(&Spec::parse("link", LINKS, link).unwrap(), &*scenario).unwrap();
         let policy = build_policy(&Spec::parse("policy", POLICIES, policy).unwrap(), &*scenario).unwrap();
         Self(scenario, link, policy)
     }

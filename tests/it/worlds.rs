@@ -2,8 +2,9 @@
 
 use std::path::Path;
 
-use ccmarl::link::{Setting, build as build_link};
-use ccmarl::record::{Difference, EpisodeReturn, RecordError, Recording, Resimulation, build_policy, returns};
+use ccmarl::record::{
+    Difference, EpisodeReturn, RecordError, Recording, Resimulation, build_link, build_policy, returns,
+};
 use ccmarl::registry::Spec;
 use ccmarl::rng::{Seeds, Stream, uniform};
 use ccmarl::scenario::{SCENARIOS, Scenario, Scratch, Worlds, build};
@@ -180,7 +181,7 @@ impl EpisodeSource for Held {
 /// One recorded episode under a random policy.
 fn held(spec: &Spec) -> Held {
     let scenario = build(spec).unwrap();
-    let link = build_link(&Spec::new("dropout").with("p", 0.3), &Setting { distance_unit: 1.0 }).unwrap();
+    let link = build_link(&Spec::new("dropout").with("p", 0.3), &*scenario).unwrap();
     let policy = build_policy(&Spec::new("random"), &*scenario).unwrap();
     let recording = Recording { scenario: &*scenario, link: &*link, policy: &*policy, seed: 1, episodes: 1 };
     Held(recording.manifest(), vec![recording.episode(0)])
@@ -393,7 +394,7 @@ fn renumbered_agents_move_see_and_earn_alike() {
 /// Mean and standard error of the return over `episodes`.
 fn mean_return(scenario: &Spec, policy: &str, episodes: u64) -> (f64, f64) {
     let scenario = build(scenario).unwrap();
-    let link = build_link(&Spec::new("perfect"), &Setting { distance_unit: 1.0 }).unwrap();
+    let link = build_link(&Spec::new("perfect"), &*scenario).unwrap();
     let policy = build_policy(&Spec::new(policy), &*scenario).unwrap();
     let recording = Recording { scenario: &*scenario, link: &*link, policy: &*policy, seed: 1, episodes };
     let all: Vec<EpisodeReturn> = returns(&recording, 0, episodes);

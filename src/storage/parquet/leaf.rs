@@ -398,7 +398,8 @@ impl Out {
             (Self::F64(out), Values::Split) => {
                 let [a, b, c, d, e, f, g, h] = page.split(n);
                 let halves = quads([a, b, c, d]).zip(quads([e, f, g, h]));
-                let whole = |(low, high)| u64::from(u32::from_le_bytes(low)) | u64::from(u32::from_le_bytes(high)) << 32;
+                let whole =
+                    |(low, high)| u64::from(u32::from_le_bytes(low)) | u64::from(u32::from_le_bytes(high)) << 32;
                 out.extend(halves.map(|halves| f64::from_bits(whole(halves))));
             }
             (Self::Bit(out), _) => out.append_packed_range(page.at..page.at + n, &page.values),

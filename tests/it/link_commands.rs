@@ -1,0 +1,151 @@
+//! `fit-link` and `link` from outside, and traces and fitted links inside training.
+
+use std::path::Path;
+
+use assert_cmd::Command;
+use ccmarl::storage;
+use serde_json::Value;
+
+/// Runs the program in `dir`: exit code, stdout, stderr.
+fn run(dir: &Path, words: &str) -> (i32, String, String) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ccmarl"));
+    let output = command.env_remove("COLUMNS").current_dir(dir).args(words.split_whitespace()).output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    (output.status.code().unwrap(), text(output.stdout), text(output.stderr))
+}
+
+fn done(dir: &Path, words: &str) -> (String, String) {
+    let (code, out, err) = run(dir, words);
+    assert_eq!(code, 0, "{words}: {err}");
+    (out, err)
+}
+
+fn record(dir: &Path, link: &str, episodes: u32, out: &str) {
+    done(dir, &format!("record --scenario simple_spread --link {link} --episodes {episodes} --out {out}"));
+}
+
+fn bits(store: &Path) -> Vec<Vec<bool>> {
+    let mut source = storage::open(store).unwrap();
+    std::iter::from_fn(|| source.next_episode().unwrap()).map(|episode| episode.link).collect()
+}
+
+#[test]
+fn a_fitted_link_is_printed_written_drawn_and_used() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    record(dir, "dropout:0.3", 100, "store");
+    let (out, err) = done(dir, "fit-link store --out fits/link.json");
+    for words in
+        ["probability of loss", "95 %, all together", "log-likelihood", "Brier", "balanced accuracy", "dropout *"]
+    {
+        assert!(out.contains(words), "lacks {words:?}:\n{out}");
+    }
+    assert!(err.contains("note: no markov: no burst chain is earned"), "{err}");
+    assert!(err.contains("use it with --link file:fits/link.json"), "{err}");
+    let svg = std::fs::read_to_string(dir.join("fits/link.reliability.svg")).unwrap();
+    assert!(svg.starts_with("<svg") && svg.contains("Reliability of the fitted link: dropout"));
+    let (json, _) = done(dir, "fit-link store --out other.json --format json");
+    let json: Value = serde_json::from_str(&json).unwrap();
+    assert_eq!((&json["link"]["name"], &json["fit"]["model"]), (&Value::from("dropout"), &Value::from("dropout")));
+    record(dir, "file:fits/link.json", 20, "again");
+    let manifest = storage::open(&dir.join("again")).unwrap().manifest().clone();
+    assert_eq!(
+        (&manifest.link["name"], &manifest.link["link"]["name"]),
+        (&Value::from("file"), &Value::from("dropout"))
+    );
+}
+
+#[test]
+fn fit_link_refuses_what_it_cannot_use_and_replaces_only_its_own() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    record(dir, "dropout:0.3", 20, "store");
+    record(dir, "perfect", 20, "lossless");
+    std::fs::write(dir.join("thesis.json"), "{}").unwrap();
+    std::fs::write(dir.join("bad.csv"), "episode,step,sender,receiver,delivered\n0,0,a,b,2\n").unwrap();
+    std::fs::write(dir.join("bad.json"), r#"{"kind":"ccmarl link","link":{"name":"dropout","p":7}}"#).unwrap();
+    done(dir, "fit-link store --out link.json");
+    for (words, code, fault) in [
+        ("fit-link store --out link.json", 2, "output exists: give --force"),
+        ("fit-link store --out thesis.json --force", 1, "refusing to replace what ccmarl did not make"),
+        ("fit-link nowhere --out x.json", 1, "no such file or directory: nowhere"),
+        ("fit-link lossless --out x.json", 1, "all 3120 messages were delivered: a fit needs delivered and lost ones"),
+        ("fit-link store --model markov --out x.json", 1, "no burst chain is earned"),
+        (
+            "fit-link bad.csv --out x.json",
+            1,
+            "trace: column delivered, row 1: expected true, false, 1 or 0, found \"2\"",
+        ),
+        ("link simulate file:bad.json", 1, "link file: dropout: p must be in [0, 1], found 7: bad.json"),
+        ("link simulate trace:store --episodes 21", 2, "the trace behind the link holds 20 episodes"),
+        (
+            "link simulate trace:store --scenario simple_tag --episodes 5",
+            1,
+            "trace: its agents are agent_0, agent_1, agent_2",
+        ),
+        ("link simulate dropuot:0.1", 2, "unknown link \"dropuot\": did you mean dropout?"),
+    ] {
+        let (found, out, err) = run(dir, words);
+        assert_eq!((found, out.as_str()), (code, ""), "{words}: {err}");
+        assert!(err.starts_with(&format!("error: {fault}")) && err.lines().count() == 1, "{words}: {err}");
+        assert!(!dir.join("x.json").exists(), "{words} left something behind");
+    }
+    let (code, _, err) = run(dir, "fit-link store --model learnt --out x.json");
+    assert!(code == 2 && err.contains("[possible values: dropout, distance, markov, learned, auto]"), "{err}");
+    done(dir, "fit-link store --out link.json --force");
+}
+
+#[test]
+fn link_simulate_prints_and_draws_what_a_link_does() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let (out, err) = done(dir, "link simulate markov:heavy --episodes 200 --out drawn");
+    for words in ["sender → receiver", "agent_0 → agent_1", "losses in a row", "distance, world units", "step"] {
+        assert!(out.contains(words), "lacks {words:?}:\n{out}");
+    }
+    assert!(err.contains("wrote statistics.csv and 3 figures: drawn"), "{err}");
+    for (file, words) in [
+        ("loss-by-step", "step of the episode"),
+        ("burst-lengths", "losses in a row"),
+        ("loss-by-distance", "world units"),
+    ] {
+        let svg = std::fs::read_to_string(dir.join(format!("drawn/{file}.svg"))).unwrap();
+        assert!(svg.contains(words) && svg.contains("agent_2 to agent_1"), "{file}");
+    }
+    let csv = std::fs::read_to_string(dir.join("drawn/statistics.csv")).unwrap();
+    assert!(csv.contains("\nagent_0,agent_1,step,0,200,0\n"), "the first message always arrives");
+    assert_eq!(run(dir, "link simulate markov:heavy --episodes 200 --out drawn").0, 2, "nothing is replaced unasked");
+    let (json, _) = done(dir, "link simulate markov:heavy --episodes 200 --format json");
+    let json: Value = serde_json::from_str(&json).unwrap();
+    let steps = json["total"]["steps"].as_array().unwrap();
+    assert_eq!((steps.len(), &steps[0]), (25, &serde_json::json!([1200, 0])));
+    // the same numbers for any number of threads
+    let one = Command::new(env!("CARGO_BIN_EXE_ccmarl"))
+        .env("RAYON_NUM_THREADS", "1")
+        .args(["link", "simulate", "markov:heavy", "--episodes", "200", "--format", "json"])
+        .output()
+        .unwrap();
+    assert_eq!(serde_json::from_slice::<Value>(&one.stdout).unwrap(), json);
+    let (_, note) = done(dir, "link simulate perfect --episodes 3 --out whole");
+    assert!(note.contains("note: no burst-lengths.svg: there is no burst"), "{note}");
+}
+
+#[test]
+fn a_trace_is_replayed_in_training_and_in_evaluation_and_refused_when_it_ends_too_early() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    record(dir, "markov:heavy", 10, "heavy");
+    let train = "train --scenario simple_spread --algorithm cc-maddpg --prior trace:heavy";
+    done(dir, &format!("{train} --steps 250 --out run --record rollouts"));
+    assert_eq!(bits(&dir.join("rollouts")), bits(&dir.join("heavy")), "training met the recorded bits");
+    done(dir, "evaluate run --episodes 2");
+    let (code, _, err) = run(dir, &format!("{train} --steps 275 --out longer"));
+    assert!(code == 2 && err.contains("holds 10 episodes, and 11 are asked for"), "{code}: {err}");
+    assert!(!dir.join("longer").exists());
+    // a fitted classifier as prior: its weights are in the run's configuration
+    record(dir, "distance:4", 60, "range");
+    done(dir, "fit-link range --model learned --out link.json");
+    done(dir, "train --scenario simple_spread --algorithm cc-maddpg --prior file:link.json --steps 100 --out fitted");
+    std::fs::remove_file(dir.join("link.json")).unwrap();
+    done(dir, "evaluate fitted --episodes 2");
+}
