@@ -21,6 +21,7 @@ Examples:
   ccmarl estimate-mi data/tag
   ccmarl estimate-mi data/tag.mcap --estimator jsd,club,gaussian --delivered
   ccmarl estimate-mi table.parquet --x a,b --y c --estimator gaussian,jsd --group subject
+  ccmarl estimate-mi table.csv --x a --y b --estimator ksg,ksg:10,gcmi
   ccmarl estimate-mi table.csv --x a --y b --time t --out result.json
 
 For a store: x is the message that the sender sent, y the action of the receiver at the same step, per ordered link,
@@ -31,7 +32,9 @@ In a CSV an empty cell and NaN are missing. The rows mean:
   jsd-nwj, -dv   lower bounds by the same critic, nats; jsd-certified: what the JSD alone proves
   club           upper bound, nats, often several times the truth; club-l1out: a tighter one
   club-fit       how much better club's density fits than the margin; near 0 it bounds nothing
-  gaussian       exact for normal data, bias-corrected, nats";
+  gaussian       exact for normal data, bias-corrected, nats; gcmi: the same after ranks made every column normal
+  ksg1, ksg2     nearest neighbours, no model, nats; ksg-mixed: for ties and discrete beside continuous columns
+  discrete       exact counts of categories, nats; discrete-mm: less the bias of few samples";
 
 /// Arguments of `ccmarl estimate-mi`.
 #[derive(Debug, clap::Args)]
@@ -40,8 +43,7 @@ pub(super) struct Args {
     /// A rollout store (directory, .mcap or .parquet), or with --x and --y any CSV or Parquet table
     #[arg(value_name = "PATH", value_hint = ValueHint::AnyPath)]
     path: PathBuf,
-    /// Estimators, comma-separated: club, gaussian, jsd (`ccmarl list` describes them)
-    #[arg(long, value_name = "NAMES", value_delimiter = ',', default_value = "jsd,club,gaussian")]
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', default_value = "jsd,club,gaussian", help = estimators())]
     estimator: Vec<String>,
     /// Table: columns of x, comma-separated
     #[arg(long, value_name = "COLUMNS", value_delimiter = ',', requires = "y")]
@@ -82,6 +84,15 @@ pub(super) struct Args {
     /// End with exit code 1 if any row carries a warning
     #[arg(long)]
     strict: bool,
+}
+
+/// The help of `--estimator`.
+fn estimators() -> String {
+    let names: Vec<&str> = ESTIMATORS.iter().map(|e| e.name).collect();
+    format!(
+        "Estimators, comma-separated, name or name:k: {} (`ccmarl list estimator` describes them)",
+        names.join(", ")
+    )
 }
 
 /// A job that gave no rows, and why.

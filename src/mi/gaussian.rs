@@ -32,12 +32,14 @@
 use statrs::function::gamma::digamma;
 
 use super::interval::{block_interval, t_quantile};
-use super::linear::Moments;
-use super::prepare::{some_of, tied};
-use super::{Build, Estimate, Estimator, Kind, MiError, Protocol, Unit, p_value, permuted_rows};
+use super::knn::Points;
+use super::linear::{Moments, Symmetric};
+use super::part::Part;
+use super::prepare::{Scale, scales, some_of, tied};
+use super::{Build, Estimate, Estimator, Kind, MiError, Protocol, Unit, p_value};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
-use crate::schema::{Columns, Samples};
+use crate::schema::{Columns, SampleLabels, Samples};
 
 /// The registry's entry.
 pub(super) const ENTRY: Entry<Build> = Entry {
@@ -62,95 +64,95 @@ fn build(spec: &Spec) -> Result<Box<dyn Estimator>, RegistryError> {
 
 impl Estimator for Gaussian {
     fn estimate(&self, samples: &Samples, protocol: &Protocol, seeds: &Seeds) -> Result<Vec<Estimate>, MiError> {
-        let mut warnings = samples.notes.clone();
-        let (x, y) = (
-            Scaled::new(&samples.x, samples, true, &mut warnings)?,
-            Scaled::new(&samples.y, samples, false, &mut warnings)?,
-        );
-        let (dx, dy, n) = (x.columns.len(), y.columns.len(), samples.len());
-        let needed = (2 * (dx + dy)).max(10);
-        if n < needed {
-            return Err(MiError::TooFewSamples { needed, widths: dx + dy, found: n });
-        }
-        let blocks = samples.episodes();
-        let groups = groups(&blocks);
-        let mut parts = vec![Moments::new(dx + dy); groups.last().map_or(0, |g| g + 1)];
-        let mut row = Vec::with_capacity(dx + dy);
-        for (&r, &group) in samples.rows.iter().zip(&groups) {
-            row.clear();
-            x.push(r, &mut row);
-            y.push(r, &mut row);
-            parts[group].add_row(&row);
-        }
-        let mut total = Moments::new(dx + dy);
-        for part in &parts {
-            total.add(part, 1.0);
-        }
-        warnings.extend(tied(samples));
-        let value = information(&total, dx, dy);
-        let mut out = Estimate::new("gaussian", &samples.labels, value, Unit::Nats, Kind::Estimate, n);
-        if value.is_infinite() {
-            warnings
-                .push(format!("infinite (copy): {} is a linear function of {}", samples.labels.y, samples.labels.x));
-        } else {
-            interval(&mut out, &total, &parts, dx, dy);
-            let local = local_information(samples, &x, &y, &total);
-            out.n_effective = block_interval(&local, &blocks).n_effective;
-            if parts.len() < 10 {
-                warnings.push(format!("few blocks: the interval rests on {} episodes", parts.len()));
-            }
-        }
-        let mut episodes = blocks;
-        episodes.dedup();
-        let mut rng = seeds.stream("null");
-        let null: Vec<f64> = (0..protocol.permutations)
-            .map(|_| {
-                let mut moments = Moments::new(dx + dy);
-                for (&from, &r) in permuted_rows(samples, &episodes, &samples.rows, &mut rng).iter().zip(&samples.rows)
-                {
-                    row.clear();
-                    x.push(from, &mut row);
-                    y.push(r, &mut row);
-                    moments.add_row(&row);
-                }
-                information(&moments, dx, dy)
-            })
-            .collect();
-        out.p_value = p_value(value, &null);
-        out.warnings = warnings;
-        Ok(vec![out])
+        let mut row = estimate("gaussian", samples, *protocol, seeds)?;
+        row.warnings.extend(tied(samples));
+        Ok(vec![row])
     }
+}
+
+/// The row of an estimator called `name`.
+pub(super) fn estimate(name: &str, samples: &Samples, protocol: Protocol, seeds: &Seeds) -> Result<Estimate, MiError> {
+    let (mut warnings, labels) = (samples.notes.clone(), &samples.labels);
+    let x = Scaled::new(&samples.x, samples, &labels.x, &mut warnings)?;
+    let y = Scaled::new(&samples.y, samples, &labels.y, &mut warnings)?;
+    let (dx, dy, n) = (x.columns.len(), y.columns.len(), samples.len());
+    let needed = (2 * (dx + dy)).max(10);
+    if n < needed {
+        return Err(MiError::TooFewSamples { needed, widths: dx + dy, found: n });
+    }
+    let blocks = samples.episodes();
+    let groups = groups(&blocks);
+    let mut parts = vec![Moments::new(dx + dy); groups.last().map_or(0, |g| g + 1)];
+    let mut row = Vec::with_capacity(dx + dy);
+    for (&r, &group) in samples.rows.iter().zip(&groups) {
+        row.clear();
+        x.push(r, &mut row);
+        y.push(r, &mut row);
+        parts[group].add_row(&row);
+    }
+    let mut total = Moments::new(dx + dy);
+    for part in &parts {
+        total.add(part, 1.0);
+    }
+    let value = information(&total, dx, dy);
+    let mut out = Estimate::new(name, labels, value, Unit::Nats, Kind::Estimate, n);
+    if value.is_infinite() {
+        warnings.push(copy(labels));
+    } else {
+        interval(&mut out, &total, &parts, dx, dy);
+        let local = local_information(samples, &x, &y, &total);
+        out.n_effective = block_interval(&local, &blocks).n_effective;
+        if parts.len() < 10 {
+            warnings.push(format!("few blocks: the interval rests on {} episodes", parts.len()));
+        }
+    }
+    let statistic = |from: &[u32]| {
+        let (mut moments, mut row) = (Moments::new(dx + dy), Vec::with_capacity(dx + dy));
+        for (&from, &r) in from.iter().zip(&samples.rows) {
+            row.clear();
+            x.push(from, &mut row);
+            y.push(r, &mut row);
+            moments.add_row(&row);
+        }
+        information(&moments, dx, dy)
+    };
+    let part = Part::all(samples);
+    let null = part.null(samples, protocol, seeds, &statistic);
+    out.p_value = p_value(value, &null);
+    out.warnings = warnings;
+    Ok(out)
+}
+
+/// What stands beside an infinite value.
+pub(super) fn copy(labels: &SampleLabels) -> String {
+    format!("infinite (copy): {} is a linear function of {}", labels.y, labels.x)
+}
+
+/// Whether x determines a column of y linearly, or y one of x. Both standardised, of the same rows.
+pub(super) fn determined(x: &Points, y: &Points) -> bool {
+    let mut moments = Moments::new(x.width + y.width);
+    let mut row = Vec::new();
+    for i in 0..x.len() {
+        row.clear();
+        row.extend_from_slice(x.row(i));
+        row.extend_from_slice(y.row(i));
+        moments.add_row(&row);
+    }
+    let joint = moments.covariance();
+    let lost = |part: Symmetric| part.cholesky(COLLINEAR).pivots.iter().filter(|p| **p == 0.0).count();
+    let alone = lost(joint.block(0..x.width)) + lost(joint.block(x.width..x.width + y.width));
+    x.len() > x.width + y.width && lost(joint) > alone
 }
 
 /// Which columns are used, and how they are scaled so that sums of squares keep their digits.
 struct Scaled<'a> {
     source: &'a Columns,
-    /// Column, mean, 1/standard deviation.
-    columns: Vec<(usize, f64, f64)>,
+    columns: Vec<Scale>,
 }
 
 impl<'a> Scaled<'a> {
-    fn new(source: &'a Columns, samples: &Samples, is_x: bool, warnings: &mut Vec<String>) -> Result<Self, MiError> {
-        let n = samples.len() as f64;
-        let (mut columns, mut constant) = (Vec::new(), Vec::new());
-        for c in 0..source.width() {
-            let values = || samples.rows.iter().map(|&r| source.data[r as usize * source.width() + c]);
-            let mean = values().sum::<f64>() / n;
-            let variance = values().map(|v| (v - mean) * (v - mean)).sum::<f64>() / n;
-            if variance > 1e-24 * mean * mean && variance > 0.0 {
-                columns.push((c, mean, 1.0 / libm::sqrt(variance)));
-            } else {
-                constant.push(source.names[c].as_str());
-            }
-        }
-        if columns.is_empty() {
-            let column = if is_x { samples.labels.x.clone() } else { samples.labels.y.clone() };
-            return Err(MiError::Constant { column });
-        }
-        if !constant.is_empty() {
-            warnings.push(format!("constant, left out: {}", some_of(&constant)));
-        }
-        let mut scaled = Self { source, columns };
+    fn new(source: &'a Columns, samples: &Samples, label: &str, warnings: &mut Vec<String>) -> Result<Self, MiError> {
+        let mut scaled = Self { source, columns: scales(source, &samples.rows, label, warnings)? };
         let mut moments = Moments::new(scaled.columns.len());
         let mut row = Vec::new();
         for &r in &samples.rows {
@@ -159,7 +161,7 @@ impl<'a> Scaled<'a> {
             moments.add_row(&row);
         }
         let pivots = moments.covariance().cholesky(COLLINEAR).pivots;
-        let names: Vec<&str> = scaled.columns.iter().map(|&(c, ..)| source.names[c].as_str()).collect();
+        let names: Vec<&str> = scaled.columns.iter().map(|s| source.names[s.column].as_str()).collect();
         let collinear: Vec<&str> = names.iter().zip(&pivots).filter(|(_, p)| **p == 0.0).map(|(n, _)| *n).collect();
         if !collinear.is_empty() && samples.len() > scaled.columns.len() {
             warnings.push(format!("linear functions of the columns before them, left out: {}", some_of(&collinear)));
@@ -171,7 +173,7 @@ impl<'a> Scaled<'a> {
 
     fn push(&self, row: u32, out: &mut Vec<f64>) {
         let row = self.source.row(row as usize);
-        out.extend(self.columns.iter().map(|&(c, mean, scale)| (row[c] - mean) * scale));
+        out.extend(self.columns.iter().map(|s| s.of(row)));
     }
 }
 

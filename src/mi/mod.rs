@@ -4,21 +4,31 @@
 //! 2·JSD ∈ \[0, 2 ln 2\], has the unit `jsd` here; everything else is in nats.
 //!
 //! Adding an estimator: write `mi/<name>.rs` with an `ENTRY`, and add `mod <name>;` and `<name>::ENTRY,` below. The
-//! rest of the room is protocol: `split` and `prepare` (by episode), `fit` (training, stopped on validation),
-//! `interval` (episodes as blocks), `null` (whole episodes permuted), `run` (all jobs in parallel).
+//! rest of the room is protocol: `prepare` (standardised, split by episode), `fit` (training, stopped on validation),
+//! `interval` (episodes as blocks), `null` (whole episodes permuted), `part` (parts of the samples by whole episodes),
+//! `run` (all jobs in parallel); and arithmetic: `linear` (covariances), `knn` and `neighbours`, `counts`.
 
 mod club;
 pub mod conditional;
+mod counts;
 pub mod critic;
+mod discrete;
 mod estimate;
 mod fit;
 mod gaussian;
+mod gcmi;
 mod interval;
 mod jsd;
+mod knn;
+mod ksg1;
+mod ksg2;
+mod ksg_mixed;
 mod linear;
 pub mod losses;
 mod negatives;
+mod neighbours;
 mod null;
+mod part;
 mod prepare;
 mod run;
 
@@ -26,6 +36,7 @@ pub use estimate::{Estimate, Kind, Unit, is_estimates, to_csv, to_json, to_parqu
 pub use interval::{Interval, block_interval};
 pub use jsd::certified;
 pub use negatives::{all_others, derangements};
+pub use neighbours::ksg1_value;
 pub use null::{p_value, permuted_rows};
 pub use run::{Job, JobResult, Named, Plan, run};
 
@@ -34,7 +45,17 @@ use crate::rng::Seeds;
 use crate::schema::Samples;
 
 /// All estimators.
-pub const ESTIMATORS: &[Entry<Build>] = &[club::ENTRY, gaussian::ENTRY, jsd::ENTRY];
+pub const ESTIMATORS: &[Entry<Build>] = &[
+    club::ENTRY,
+    discrete::ENTRY,
+    gaussian::ENTRY,
+    gcmi::ENTRY,
+    jsd::ENTRY,
+    ksg1::USUAL,
+    ksg1::ENTRY,
+    ksg2::ENTRY,
+    ksg_mixed::ENTRY,
+];
 
 /// Makes an estimator from its parameters.
 pub type Build = fn(&Spec) -> Result<Box<dyn Estimator>, RegistryError>;

@@ -1,6 +1,7 @@
 //! Samples made ready for a trained estimator: split by episode, standardised by the training part, `f32`.
 
 use super::MiError;
+use super::knn::Points;
 use crate::rng::{self, Seeds};
 use crate::schema::{Columns, Samples};
 
@@ -68,16 +69,46 @@ fn standardise(
     label: &str,
     warnings: &mut Vec<String>,
 ) -> Result<(Vec<f32>, usize), MiError> {
-    let n = train.len() as f64;
+    let scales = scales(columns, train, label, warnings)?;
+    let rows = (0..columns.rows()).map(|r| columns.row(r));
+    let data = rows.flat_map(|row| scales.iter().map(|s| s.of(row) as f32)).collect();
+    Ok((data, scales.len()))
+}
+
+/// A column that varies, and how it is standardised.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Scale {
+    /// Which column.
+    pub(super) column: usize,
+    mean: f64,
+    /// 1/standard deviation.
+    factor: f64,
+}
+
+impl Scale {
+    /// The column's standardised value in a row.
+    pub(super) fn of(self, row: &[f64]) -> f64 {
+        (row[self.column] - self.mean) * self.factor
+    }
+}
+
+/// The columns that vary over `rows`; the others are named in `warnings`.
+pub(super) fn scales(
+    columns: &Columns,
+    rows: &[u32],
+    label: &str,
+    warnings: &mut Vec<String>,
+) -> Result<Vec<Scale>, MiError> {
+    let n = rows.len() as f64;
     let (mut scales, mut constant) = (Vec::new(), Vec::new());
-    for c in 0..columns.width() {
-        let value = |&r: &u32| columns.data[r as usize * columns.width() + c];
-        let mean = train.iter().map(value).sum::<f64>() / n;
-        let variance = train.iter().map(|r| (value(r) - mean) * (value(r) - mean)).sum::<f64>() / n;
+    for column in 0..columns.width() {
+        let value = |&r: &u32| columns.data[r as usize * columns.width() + column];
+        let mean = rows.iter().map(value).sum::<f64>() / n;
+        let variance = rows.iter().map(|r| (value(r) - mean) * (value(r) - mean)).sum::<f64>() / n;
         if variance > 1e-24 * mean * mean && variance > 0.0 {
-            scales.push((c, mean, 1.0 / libm::sqrt(variance)));
+            scales.push(Scale { column, mean, factor: 1.0 / libm::sqrt(variance) });
         } else {
-            constant.push(columns.names[c].as_str());
+            constant.push(columns.names[column].as_str());
         }
     }
     if scales.is_empty() {
@@ -86,9 +117,20 @@ fn standardise(
     if !constant.is_empty() {
         warnings.push(format!("constant, left out: {}", some_of(&constant)));
     }
-    let rows = (0..columns.rows()).map(|r| columns.row(r));
-    let data = rows.flat_map(|row| scales.iter().map(|&(c, mean, scale)| ((row[c] - mean) * scale) as f32)).collect();
-    Ok((data, scales.len()))
+    Ok(scales)
+}
+
+/// All rows in `f64`, standardised over `rows`; constant columns are left out.
+pub(super) fn points(
+    columns: &Columns,
+    rows: &[u32],
+    label: &str,
+    warnings: &mut Vec<String>,
+) -> Result<Points, MiError> {
+    let scales = scales(columns, rows, label, warnings)?;
+    let all = (0..columns.rows()).map(|r| columns.row(r));
+    let data = all.flat_map(|row| scales.iter().map(|s| s.of(row))).collect();
+    Ok(Points { data, width: scales.len() })
 }
 
 /// Up to three names, and how many more.
@@ -113,7 +155,10 @@ pub(super) fn tied(samples: &Samples) -> Option<String> {
         .filter(|(columns, _)| all_tied(columns))
         .map(|(_, label)| label.as_str())
         .collect();
-    (!which.is_empty()).then(|| format!("tied: most values of {} occur more than once", which.join(" and of ")))
+    (!which.is_empty()).then(|| {
+        let which = which.join(" and of ");
+        format!("tied: most values of {which} occur more than once; ksg-mixed and discrete are made for such")
+    })
 }
 
 /// Rows of a flat `[rows, width]` matrix, copied together.

@@ -240,6 +240,56 @@ fn the_fixed_tables_give_their_golden_rows() {
     assert!(code == 1 && err.contains("needs at least"), "{code}: {err}");
 }
 
+#[test]
+fn categories_have_their_exact_information() {
+    // datasets/tables/README.md, recomputed there by its make.py
+    let dir = tempfile::tempdir().unwrap();
+    let tables = [coded("playtennis", dir.path()), coded("titanic", dir.path())];
+    let cases = [
+        (0, "outlook", "play", 0.246750),
+        (0, "humidity", "play", 0.151836),
+        (0, "wind", "play", 0.048127),
+        (0, "temperature", "play", 0.029223),
+        (1, "sex", "survived", 0.142391),
+        (1, "class", "survived", 0.059288),
+        (1, "age", "survived", 0.006411),
+        (1, "class,age,sex", "survived", 0.220226),
+    ];
+    for (table, x, y, bits) in cases {
+        let rows = json(&[&tables[table], "--x", x, "--y", y, "--estimator", "discrete", "--permutations", "0"]);
+        let value = rows[0]["value"].as_f64().unwrap();
+        assert!((value / std::f64::consts::LN_2 - bits).abs() < 5e-7, "{x}: {value} nats against {bits} bits");
+        assert_eq!((&rows[0]["estimator"], &rows[1]["estimator"]), (&"discrete".into(), &"discrete-mm".into()));
+    }
+}
+
+#[test]
+fn nearest_neighbours_and_ranks_read_the_flowers() {
+    let dir = tempfile::tempdir().unwrap();
+    let table = coded("iris", dir.path());
+    let value = |x: &str, y: &str, estimator: &str| {
+        json(&[&table, "--x", x, "--y", y, "--estimator", estimator])[0]["value"].as_f64().unwrap()
+    };
+    // the authors' code (mixed_KSG with scipy's cKDTree) on the same standardised columns
+    for (x, y, expected) in [
+        ("petal_length", "species", 1.127144814761),
+        ("petal_width", "species", 1.043073739296),
+        ("sepal_length", "species", 0.725989925237),
+        ("sepal_width", "species", 0.354164018143),
+        ("petal_length", "petal_width", 1.551540715939),
+    ] {
+        let found = value(x, y, "ksg-mixed");
+        assert!((found - expected).abs() < 1e-7, "{x}: {found} against {expected}");
+    }
+    assert!((value("petal_length", "petal_width", "gcmi") - 1.0).abs() < 0.3);
+    let (code, out, err) = run(&[&table, "--x", "petal_length", "--y", "petal_width", "--estimator", "ksg,ksg2:5"]);
+    assert_eq!(code, 0, "{err}");
+    assert!(
+        out.contains("ksg1:3") && out.contains("ksg2:5") && out.contains("ksg-mixed and discrete are made for such"),
+        "{out}"
+    );
+}
+
 fn assert_golden(case: &str, found: &Value, golden: &Value) {
     let name = golden["estimator"].as_str().unwrap();
     let tolerance = if name == "gaussian" { 1e-6 } else { 1e-3 };

@@ -1,0 +1,303 @@
+//! What the nearest-neighbour estimators share: their row, its interval and its p-value, whatever the terms that they
+//! average.
+
+use serde::{Deserialize, Serialize};
+use statrs::function::gamma::digamma;
+
+use super::gaussian::{copy, determined};
+use super::interval::{block_interval, t_quantile};
+use super::knn::Points;
+use super::part::Part;
+use super::prepare::{points, tied};
+use super::{Estimate, Kind, MiError, Protocol, Unit, p_value};
+use crate::registry::{RegistryError, Spec};
+use crate::rng::Seeds;
+use crate::schema::{Columns, Samples};
+
+/// Standardised distances that differ by less are equal: what rounding makes of values on a grid.
+const SAME: f64 = 1e-14;
+/// The same, as a share of the distance.
+const SAME_SHARE: f64 = 1e-9;
+
+/// Joint columns above which the estimate is said to be too low.
+const WIDE: usize = 8;
+
+/// The local terms of an estimator, `[n]` in nats: their mean is the estimate. Takes x, y and k.
+pub(super) type Terms = fn(&Points, &Points, usize) -> Vec<f64>;
+
+/// Parameters of a nearest-neighbour estimator.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct Params {
+    k: usize,
+}
+
+impl Default for Params {
+    fn default() -> Self {
+        Self { k: 3 }
+    }
+}
+
+/// A nearest-neighbour estimator.
+pub(super) struct Neighbours {
+    pub(super) name: &'static str,
+    pub(super) k: usize,
+    pub(super) terms: Terms,
+    /// Whether it is made for values that occur more than once.
+    pub(super) for_ties: bool,
+}
+
+impl Neighbours {
+    /// Reads k from the parameters.
+    pub(super) fn new(name: &'static str, spec: &Spec, terms: Terms, for_ties: bool) -> Result<Self, RegistryError> {
+        let Params { k } = spec.params()?;
+        spec.in_range("k", k as f64, 1.0, 1000.0)?;
+        Ok(Self { name, k, terms, for_ties })
+    }
+
+    /// The row.
+    pub(super) fn row(&self, samples: &Samples, protocol: Protocol, seeds: &Seeds) -> Result<Estimate, MiError> {
+        let (labels, n) = (&samples.labels, samples.len());
+        let needed = (self.k + 1).max(10);
+        if n < needed {
+            return Err(MiError::TooFewSamples { needed, widths: samples.x.width() + samples.y.width(), found: n });
+        }
+        let mut warnings = samples.notes.clone();
+        let x = points(&samples.x, &samples.rows, &labels.x, &mut warnings)?;
+        let y = points(&samples.y, &samples.rows, &labels.y, &mut warnings)?;
+        let width = x.width + y.width;
+        let all = Part::all(samples);
+        let (own_x, own_y) = (picked(&x, &all.rows), picked(&y, &all.rows));
+        let local = (self.terms)(&own_x, &own_y, self.k);
+        let value = mean(&local);
+        let name = format!("{}:{}", self.name, self.k);
+        let mut out = Estimate::new(&name, labels, value, Unit::Nats, Kind::Estimate, n);
+        out.n_effective = block_interval(&local, &samples.episodes()).n_effective;
+        let statistic = |from: &[u32], rows: &[u32]| mean(&(self.terms)(&picked(&x, from), &picked(&y, rows), self.k));
+        let limits = Limits::of(width);
+        let part = Part::drawn(samples, limits.interval, &seeds.child("interval"));
+        let error = part.subsampled_error(n, 4 * (self.k + 1), seeds, &|rows| statistic(rows, rows));
+        if let Some((error, degrees)) = error {
+            let half = error * t_quantile(degrees + 1);
+            (out.interval_low, out.interval_high) = (Some(value - half), Some(value + half));
+        }
+        let part = Part::drawn(samples, limits.null, &seeds.child("null"));
+        if protocol.permutations > 0 {
+            let null = part.null(samples, protocol, seeds, &|from| statistic(from, &part.rows));
+            out.p_value = p_value(statistic(&part.rows, &part.rows), &null);
+        }
+        if all.len() < 20 {
+            warnings.push(format!("few blocks: the interval rests on {} episodes", all.len()));
+        }
+        if !self.for_ties {
+            if determined(&own_x, &own_y) {
+                out.value = f64::INFINITY;
+                (out.interval_low, out.interval_high) = (None, None);
+                warnings.push(copy(labels));
+            }
+            warnings.extend(tied(samples));
+        }
+        // all that k neighbours among n samples can show
+        let ceiling = digamma(n as f64) - digamma(self.k as f64);
+        if out.value.is_finite() && value > 0.8 * ceiling {
+            warnings.push(format!("near the ceiling of ψ(n) − ψ(k) = {ceiling:.2}: the truth may be far higher"));
+        }
+        if width >= WIDE {
+            warnings.push(format!("{width} columns: nearest neighbours see too little dependence in so many"));
+        }
+        out.warnings = warnings;
+        Ok(out)
+    }
+}
+
+/// The radius, inclusive, within which points are closer than `distance`; at distance 0: within which they are equal.
+pub(super) fn closer_than(distance: f64) -> f64 {
+    if distance <= SAME { SAME } else { distance - SAME.max(SAME_SHARE * distance) }
+}
+
+/// The radius, inclusive, within which points are no farther than `distance`.
+pub(super) fn up_to(distance: f64) -> f64 {
+    distance + SAME.max(SAME_SHARE * distance)
+}
+
+/// Whether points at this distance are equal.
+pub(super) fn is_zero(distance: f64) -> bool {
+    distance <= SAME
+}
+
+/// Samples behind what is computed many times over; less where neighbours cost more.
+struct Limits {
+    interval: usize,
+    null: usize,
+}
+
+impl Limits {
+    fn of(width: usize) -> Self {
+        if width <= 4 { Self { interval: 20_000, null: 4000 } } else { Self { interval: 6000, null: 1500 } }
+    }
+}
+
+fn picked(points: &Points, rows: &[u32]) -> Points {
+    let data = rows.iter().flat_map(|&r| points.row(r as usize).iter().copied()).collect();
+    Points { data, width: points.width }
+}
+
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
+}
+
+/// The value of `ksg1` alone, in nats, on rows that are finite and already scaled: x `[n, d_x]`, y `[n, d_y]`.
+///
+/// # Panics
+/// When there are fewer than k + 1 rows, or not as many of y as of x.
+pub fn ksg1_value(x: &Columns, y: &Columns, k: usize) -> f64 {
+    assert!(k > 0 && x.rows() > k && x.rows() == y.rows(), "ksg1 needs pairs, and more of them than neighbours");
+    let points = |c: &Columns| Points { data: c.data.clone(), width: c.width() };
+    mean(&super::ksg1::terms(&points(x), &points(y), k))
+}
+
+/// ψ(1), …, ψ(n) at their index, by ψ(m + 1) = ψ(m) + 1/m; index 0 is not used.
+pub(super) fn digammas(n: usize) -> Vec<f64> {
+    let mut out = Vec::with_capacity(n + 1);
+    out.push(f64::NAN);
+    let mut psi = digamma(1.0);
+    for m in 1..=n {
+        out.push(psi);
+        psi += 1.0 / m as f64;
+    }
+    out
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use crate::mi::ESTIMATORS;
+    use crate::mi::run::tests::{linear_samples, samples_of};
+    use crate::rng;
+
+    /// Points of two widths with correlated first columns; `levels` > 0 rounds to so many steps per unit.
+    pub(in crate::mi) fn pair(n: usize, widths: [usize; 2], levels: f64, seed: u64) -> (Points, Points) {
+        let mut rng = Seeds::new(seed).stream("pair");
+        let (mut x, mut y) = (Vec::new(), Vec::new());
+        let rounded = |v: f64| if levels > 0.0 { (v * levels).round() / levels } else { v };
+        for _ in 0..n {
+            let shared = rng::normal(&mut rng);
+            x.extend((0..widths[0]).map(|_| rounded(0.8 * shared + 0.6 * rng::normal(&mut rng))));
+            y.extend((0..widths[1]).map(|_| rounded(0.8 * shared + 0.6 * rng::normal(&mut rng))));
+        }
+        (Points { data: x, width: widths[0] }, Points { data: y, width: widths[1] })
+    }
+
+    /// Holds `terms` to `reference`, which compares all pairs: given the distances in x and y from i to all others, in
+    /// billionths, it returns the term of i.
+    pub(in crate::mi) fn assert_equals_all_pairs(terms: Terms, reference: fn(&[[u64; 2]], usize) -> f64) {
+        for (case, (n, widths)) in
+            [(40, [1, 1]), (300, [1, 1]), (257, [1, 3]), (300, [2, 2]), (150, [5, 5]), (64, [25, 25])]
+                .into_iter()
+                .enumerate()
+        {
+            for (levels, k) in [(0.0, 3), (0.0, 1), (0.0, 10), (10.0, 3), (2.0, 4), (0.5, 3)] {
+                let (x, y) = pair(n, widths, levels, case as u64);
+                let apart = |p: &Points, i: usize, j: usize| {
+                    let widest = p.row(i).iter().zip(p.row(j)).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                    (widest * 1e9).round() as u64
+                };
+                let found = terms(&x, &y, k);
+                assert_eq!(found.len(), n);
+                for (i, found) in found.into_iter().enumerate() {
+                    let others = (0..n).filter(|&j| j != i);
+                    let distances: Vec<[u64; 2]> = others.map(|j| [apart(&x, i, j), apart(&y, i, j)]).collect();
+                    let expected = reference(&distances, k);
+                    assert!(
+                        (found - expected).abs() < 1e-7,
+                        "n {n} levels {levels} k {k} point {i}: {found} {expected}"
+                    );
+                }
+            }
+        }
+    }
+
+    fn row(name: &str, samples: &Samples, permutations: usize) -> Estimate {
+        let spec = Spec::parse("estimator", ESTIMATORS, name).unwrap();
+        let estimator = (crate::registry::find("estimator", ESTIMATORS, &spec.name).unwrap().build)(&spec).unwrap();
+        estimator.estimate(samples, &Protocol { permutations }, &Seeds::new(1)).unwrap().remove(0)
+    }
+
+    #[test]
+    fn the_correlated_normal_is_recovered_by_all() {
+        for (rho, truth) in [(0.0, 0.0), (0.75, 0.4133), (0.95, 1.1640)] {
+            let samples = linear_samples(rho, 3000, 1, 5);
+            for name in ["ksg1", "ksg2", "ksg-mixed"] {
+                let found = row(name, &samples, 39);
+                assert_eq!(found.estimator, format!("{name}:3"));
+                assert!((found.value - truth).abs() < 0.05, "{name} {rho}: {}", found.value);
+                let (low, high) = (found.interval_low.unwrap(), found.interval_high.unwrap());
+                assert!(low < truth + 0.02 && truth - 0.02 < high && high - low < 0.16, "{name} {rho}: {low} {high}");
+                assert_eq!(found.p_value.unwrap() <= 0.05, rho > 0.0, "{name} {rho}: {:?}", found.p_value);
+                assert!(found.warnings.is_empty(), "{:?}", found.warnings);
+            }
+        }
+    }
+
+    #[test]
+    fn k_is_read_from_the_name_and_bounded() {
+        let samples = linear_samples(0.5, 200, 1, 1);
+        assert_eq!(row("ksg", &samples, 0).estimator, "ksg1:3");
+        assert_eq!(row("ksg:5", &samples, 0), row("ksg1:5", &samples, 0));
+        for (text, message) in [
+            ("ksg1:0", "ksg1: k must be in [1, 1000], found 0"),
+            ("ksg2:1001", "ksg2: k must be in [1, 1000], found 1001"),
+            ("ksg-mixed:1.5", "ksg-mixed: k: invalid type: floating point `1.5`, expected usize"),
+        ] {
+            let spec = Spec::parse("estimator", ESTIMATORS, text).unwrap();
+            let entry = crate::registry::find("estimator", ESTIMATORS, &spec.name).unwrap();
+            assert_eq!((entry.build)(&spec).err().unwrap().to_string(), message);
+        }
+    }
+
+    #[test]
+    fn copies_ties_many_columns_and_few_samples_are_named() {
+        let normal = linear_samples(0.5, 200, 1, 1);
+        let copied = Samples { y: std::sync::Arc::clone(&normal.x), ..normal.clone() };
+        let found = row("ksg", &copied, 0);
+        assert!(found.value.is_infinite() && found.interval_low.is_none());
+        assert_eq!(found.warnings, ["infinite (copy): y is a linear function of x"]);
+        let steps: Vec<Vec<f64>> = (0..60).map(|i| vec![f64::from(i * i % 7)]).collect();
+        let others: Vec<Vec<f64>> = (0..60).map(|i| vec![f64::from(i * 7 % 5)]).collect();
+        let tied = row("ksg2", &samples_of(&steps, &others), 0).warnings.join("; ");
+        assert!(tied.contains("more than once; ksg-mixed and discrete are made for such"), "{tied}");
+        assert_eq!(row("ksg-mixed", &samples_of(&steps, &others), 0).warnings, [""; 0]);
+        let bent: Vec<Vec<f64>> = normal.x.data.iter().map(|&v| vec![(0.3 * v).exp()]).collect();
+        let x: Vec<Vec<f64>> = normal.x.data.iter().map(|&v| vec![v]).collect();
+        let near = row("ksg", &samples_of(&x, &bent), 0).warnings.join("; ");
+        assert!(near.contains("near the ceiling of ψ(n) − ψ(k) = 4.37"), "{near}");
+        let wide = row("ksg", &linear_samples(0.5, 200, 4, 1), 0).warnings.join("; ");
+        assert!(wide.contains("8 columns: nearest neighbours see too little"), "{wide}");
+        let few = linear_samples(0.5, 10, 1, 1);
+        let spec = Spec::parse("estimator", ESTIMATORS, "ksg:10").unwrap();
+        let estimator = (ESTIMATORS.iter().find(|e| e.name == "ksg").unwrap().build)(&spec).unwrap();
+        let error = estimator.estimate(&few, &Protocol::default(), &Seeds::new(1)).unwrap_err();
+        assert_eq!(error, MiError::TooFewSamples { needed: 11, widths: 2, found: 10 });
+    }
+
+    #[test]
+    fn the_interval_covers_the_truth_as_often_as_it_says() {
+        let truth = 0.413339;
+        let covered = (0..100)
+            .filter(|&seed| {
+                let found = row("ksg", &linear_samples(0.75, 400, 1, 1000 + seed), 0);
+                found.interval_low.unwrap() <= truth && truth <= found.interval_high.unwrap()
+            })
+            .count();
+        // 95 % of 100: 89 or fewer has probability 0.01, all has 0.006
+        assert!((89..=100).contains(&covered), "{covered}");
+    }
+
+    #[test]
+    fn digamma_by_recurrence_keeps_its_digits() {
+        let table = digammas(100_000);
+        for m in [1, 2, 10, 1000, 100_000] {
+            assert!((table[m] - digamma(m as f64)).abs() < 1e-11, "{m}");
+        }
+    }
+}
