@@ -7,7 +7,7 @@
 //! so none is its own partner.
 
 use super::TrainError;
-use super::config::{DumieConfig, LostMessage, Shaping};
+use super::config::{DumieConfig, LostMessage, Negatives, Shaping};
 use super::replay::Ring;
 use crate::algo::Batch;
 use crate::mi::conditional::{ConditionalTape, GaussianConditional};
@@ -346,7 +346,11 @@ impl Dumie {
 }
 
 /// `k` random cyclic shifts of `0..n`, as `[n, k]` indices: derangements without a draw per element.
-fn shifts(rng: &mut Stream, n: usize, k: usize, out: &mut Vec<u32>) {
+fn shifts(rng: &mut Stream, n: usize, negatives: Negatives, out: &mut Vec<u32>) {
+    let Negatives::Count(k) = negatives else {
+        *out = crate::mi::all_others(n);
+        return;
+    };
     let offsets: Vec<usize> = (0..k).map(|_| 1 + rng::below(rng, n - 1)).collect();
     out.clear();
     out.extend((0..n).flat_map(|i| offsets.iter().map(move |&o| ((i + o) % n) as u32)));
