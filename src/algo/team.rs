@@ -39,7 +39,8 @@ impl Team {
     /// All actors act on `rows` rows of `observations` `[rows, O]` under the link bits `[rows, N²]`, sender by receiver.
     pub fn act(&mut self, actors: &Actors, observations: &[f32], link: &[bool], rows: usize) {
         for (i, member) in self.members.iter_mut().enumerate() {
-            if actors.messages {
+            member.lossless = !actors.messages || all_received(actors.len(), i, &link[..rows * actors.len().pow(2)]);
+            if !member.lossless {
                 member.receive(actors, i, observations, link, rows);
             }
             let Member { packed, input, lossless, passes, .. } = member;
@@ -77,13 +78,7 @@ impl Team {
 impl Member {
     /// Zeroes what actor `i` did not receive.
     fn receive(&mut self, actors: &Actors, i: usize, observations: &[f32], link: &[bool], rows: usize) {
-        let n = actors.len();
-        let link = &link[..rows * n * n];
-        self.lossless = link.chunks_exact(n * n).all(|bits| (0..n).all(|j| j == i || bits[j * n + i]));
-        if self.lossless {
-            return;
-        }
-        let width: usize = actors.observation.iter().sum();
+        let (n, width) = (actors.len(), actors.observation.iter().sum::<usize>());
         self.input.clear();
         self.input.extend_from_slice(&observations[..rows * width]);
         for (row, bits) in self.input.chunks_exact_mut(width).zip(link.chunks_exact(n * n)) {
@@ -96,6 +91,11 @@ impl Member {
             }
         }
     }
+}
+
+/// Whether everything was delivered to learner `i` of `n`.
+fn all_received(n: usize, i: usize, link: &[bool]) -> bool {
+    link.chunks_exact(n * n).all(|bits| (0..n).all(|j| j == i || bits[j * n + i]))
 }
 
 /// The part of rows of all observations that enters actor `i`.

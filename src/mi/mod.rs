@@ -7,6 +7,7 @@
 //! rest of the room is protocol: `split` and `prepare` (by episode), `fit` (training, stopped on validation),
 //! `interval` (episodes as blocks), `null` (whole episodes permuted), `run` (all jobs in parallel).
 
+pub(crate) mod all_pairs;
 mod club;
 pub mod conditional;
 pub mod critic;
@@ -21,6 +22,7 @@ mod negatives;
 mod null;
 mod prepare;
 mod run;
+pub(crate) mod shifted;
 
 pub use estimate::{Estimate, Kind, Unit, to_csv, to_json, to_parquet};
 pub use interval::{Interval, block_interval};

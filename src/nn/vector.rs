@@ -135,6 +135,20 @@ impl Map for Sigmoid {
     }
 }
 
+struct Exp;
+
+impl Map for Exp {
+    #[inline(always)]
+    fn of<S: Simd>(&self, s: S, x: S::V) -> S::V {
+        exp(s, x)
+    }
+}
+
+/// eˣ of every element, x held to [−87, 87].
+pub(crate) fn exp_in_place(values: &mut [f32]) {
+    Level::best().run(InPlace { function: Exp, values });
+}
+
 /// tanh of every element.
 pub(crate) fn tanh_in_place(values: &mut [f32]) {
     Level::best().run(InPlace { function: Tanh, values });
@@ -216,13 +230,6 @@ mod tests {
             worst[1] = worst[1].max(if truth == 0.0 { found.abs() } else { (found / truth - 1.0).abs() });
         }
         worst
-    }
-
-    struct Exp;
-    impl Map for Exp {
-        fn of<S: Simd>(&self, s: S, x: S::V) -> S::V {
-            exp(s, x)
-        }
     }
 
     struct Ln;

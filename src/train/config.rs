@@ -112,6 +112,10 @@ pub struct DumieConfig {
     pub k: usize,
     /// Actions that stand for "independent of the message": a number of cyclic shifts per minibatch, or "all".
     pub negatives: Negatives,
+    /// One estimator of each kind for all links ("shared"), or one per ordered link ("per-link").
+    pub estimators: Estimators,
+    /// What the estimators learn from: their "rings", or all of "replay" by class.
+    pub pairs: PairSource,
     /// Where the shaping is computed.
     pub shaping: Shaping,
     /// What CLUB sees of a lost message.
@@ -159,6 +163,26 @@ impl From<Negatives> for NegativesText {
     }
 }
 
+/// Who shares an estimator.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Estimators {
+    /// All ordered links: one JSD and one CLUB, messages padded to the longest (the paper's θ₁ and θ₂).
+    Shared,
+    /// Nobody: each ordered link has its own two, its own rings, and its own minibatches.
+    PerLink,
+}
+
+/// What the estimators learn from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PairSource {
+    /// The newest pairs of either class (the parent code's two buffers).
+    Rings,
+    /// Pairs of either class drawn from the whole replay (the paper's §3.2.2).
+    Replay,
+}
+
 /// Where the shaping is computed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -190,6 +214,8 @@ impl Default for DumieConfig {
             start: 500,
             k: 1,
             negatives: Negatives::Count(16),
+            estimators: Estimators::Shared,
+            pairs: PairSource::Rings,
             shaping: Shaping::Minibatch,
             lost_message: LostMessage::Sent,
             jsd_shift: true,

@@ -22,10 +22,10 @@ use ccmarl::train::dumie::Dumie;
 use ccmarl::train::replay::Replay;
 
 /// Measurements of which the best counts.
-const REPEATS: usize = 30;
+const REPEATS: usize = 8;
 
-/// Updates per measurement.
-const UPDATES: u64 = 20;
+/// Seconds of CPU time of one measurement, at least: many times what Linux counts it in.
+const LONG: f64 = 0.25;
 
 const BATCH: usize = 1024;
 
@@ -82,7 +82,7 @@ impl Bench {
         lap(&mut parts[0]);
         self.bonus.clear();
         if let Some(dumie) = &mut self.dumie {
-            dumie.train(&mut rng, None).unwrap();
+            dumie.train(&self.replay, &mut rng, None).unwrap();
             lap(&mut parts[1]);
             dumie.bonus(&self.batch, &mut rng, &mut self.bonus);
             lap(&mut parts[2]);
@@ -92,18 +92,15 @@ impl Bench {
         self.update += 1;
     }
 
-    /// The cheapest of several measurements; parts by the clock of that measurement, scaled to its CPU time.
-    fn measure(&mut self, updates: u64) -> Cost {
+    /// The cheapest of several measurements; parts by the clock, scaled to CPU time.
+    fn measure(&mut self) -> Cost {
         let mut best = Cost { all: f64::INFINITY, parts: [0.0; 4] };
         for _ in 0..REPEATS {
-            let (start, clock, mut parts) = (cpu_seconds(), Instant::now(), [0.0; 4]);
-            for _ in 0..updates {
-                self.update(&mut parts);
-            }
-            let all = (cpu_seconds() - start) / updates as f64;
+            let mut parts = [0.0; 4];
+            let all = per_call(|| self.update(&mut parts));
             if all < best.all {
-                let scale = all / clock.elapsed().as_secs_f64();
-                best = Cost { all, parts: parts.map(|part| part * scale) };
+                let sum: f64 = parts.iter().sum();
+                best = Cost { all, parts: parts.map(|part| part * all / sum) };
             }
         }
         best
@@ -140,17 +137,17 @@ fn main() {
     let off = MaddpgConfig { messages: Messages::Off, ..MaddpgConfig::default() };
     let per_agent = |config: MaddpgConfig| MaddpgConfig { actor_step: ActorStep::PerAgent, ..config };
     let with = |negatives| Some(DumieConfig { negatives, ..DumieConfig::default() });
-    for (name, config, dumie, updates) in [
-        ("no messages", off.clone(), None, UPDATES),
-        ("messages", MaddpgConfig::default(), None, UPDATES),
-        ("cc-maddpg 16 negatives", MaddpgConfig::default(), with(Negatives::Count(16)), UPDATES),
-        ("cc-maddpg all negatives", MaddpgConfig::default(), with(Negatives::All), 3),
-        ("no messages per-agent", per_agent(off), None, UPDATES),
-        ("messages per-agent", per_agent(MaddpgConfig::default()), None, UPDATES),
+    for (name, config, dumie) in [
+        ("no messages", off.clone(), None),
+        ("messages", MaddpgConfig::default(), None),
+        ("cc-maddpg 16 negatives", MaddpgConfig::default(), with(Negatives::Count(16))),
+        ("cc-maddpg all negatives", MaddpgConfig::default(), with(Negatives::All)),
+        ("no messages per-agent", per_agent(off), None),
+        ("messages per-agent", per_agent(MaddpgConfig::default()), None),
     ] {
         let joint = config.actor_step == ActorStep::Joint;
         let mut bench = Bench::new(config, dumie);
-        let cost = bench.measure(updates);
+        let cost = bench.measure();
         let ms = |seconds: f64| 1e3 * seconds;
         let parts = cost.parts.map(|part| format!("{:.3}", ms(part))).join(",");
         let rate = bench.flop() / cost.parts[3] * 1e-9;
@@ -209,17 +206,21 @@ fn gemm() -> f64 {
     2.0 * (64 * 64 * BATCH) as f64 / seconds * 1e-9
 }
 
-/// Seconds of CPU time of the cheapest of several runs.
+/// Seconds of CPU time per call, the best of several measurements.
 fn best(mut work: impl FnMut()) -> f64 {
-    let mut best = f64::INFINITY;
-    for _ in 0..REPEATS {
-        let start = cpu_seconds();
-        for _ in 0..100 {
+    (0..REPEATS).map(|_| per_call(&mut work)).fold(f64::INFINITY, f64::min)
+}
+
+/// Seconds of CPU time per call, over a measurement.
+fn per_call(mut work: impl FnMut()) -> f64 {
+    let (start, mut calls) = (cpu_seconds(), 0);
+    while cpu_seconds() - start < LONG {
+        for _ in 0..20 {
             work();
         }
-        best = best.min((cpu_seconds() - start) / 100.0);
+        calls += 20;
     }
-    best
+    (cpu_seconds() - start) / f64::from(calls)
 }
 
 /// Seconds of CPU time of this process's first thread where Linux tells it, else of the clock.

@@ -116,8 +116,9 @@ fn a_warm_start_fills_the_rings_as_the_rollouts_did() {
         rolled.advance(None).unwrap();
     }
     warm.warm_start(ccmarl::storage::open(&store).unwrap().as_mut()).unwrap();
-    let [delivered, lost] = warm.rings().unwrap();
+    let rings = warm.rings().unwrap();
     assert_eq!(warm.rings(), rolled.rings());
+    let (delivered, lost) = (rings[0], rings[1]);
     assert!(delivered.len() == 1000 && lost.len() > 500, "{} and {}", delivered.len(), lost.len());
 }
 
