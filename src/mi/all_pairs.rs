@@ -127,19 +127,25 @@ impl Operation for SumOfSoftplus<'_> {
     fn run<S: Simd>(self, s: S) -> f64 {
         let (zero, one) = (s.splat(0.0), s.splat(1.0));
         let mut total = 0.0;
-        for chunk in self.scores.chunks_mut(FACTORS * S::WIDTH) {
-            let (mut above, mut product) = (zero, one);
-            for scores in chunk.chunks_exact_mut(S::WIDTH) {
-                let t = s.load(scores);
-                let e = exp(s, s.min(t, s.sub(zero, t)));
-                above = s.add(above, s.max(zero, t));
-                product = s.mul(product, s.add(one, e));
-                if let Some(slope) = self.slope {
-                    let share = s.div(s.splat(slope), s.add(one, e));
-                    s.store(scores, s.positive(t, share, s.mul(e, share)));
+        for chunk in self.scores.chunks_mut(FACTORS * LANES) {
+            // sixteen sums and sixteen products, in as many vectors as they take
+            let (mut above, mut products) = ([zero; 4], [one; 4]);
+            for scores in chunk.chunks_exact_mut(LANES) {
+                for (part, scores) in scores.chunks_exact_mut(S::WIDTH).enumerate() {
+                    let t = s.load(scores);
+                    let e = exp(s, s.min(t, s.sub(zero, t)));
+                    above[part] = s.add(above[part], s.max(zero, t));
+                    products[part] = s.mul(products[part], s.add(one, e));
+                    if let Some(slope) = self.slope {
+                        let share = s.div(s.splat(slope), s.add(one, e));
+                        s.store(scores, s.positive(t, share, s.mul(e, share)));
+                    }
                 }
             }
-            total += f64::from(s.sum(s.add(above, ln(s, product))));
+            for part in 0..LANES / S::WIDTH {
+                above[part] = s.add(above[part], ln(s, products[part]));
+            }
+            total += f64::from(s.sum16(above));
         }
         total
     }

@@ -2,7 +2,9 @@
 //!
 //! Its operands have few columns (16 to 64) and many rows. B and C have rows padded to whole vectors; a block of C
 //! (6 × 64 with AVX-512) stays in registers while one row of B after the other is multiplied by elements of A, read
-//! where they lie: nothing is packed. On one core of a Zen 5 this is about twice `gemm` 0.19 at these shapes.
+//! where they lie: nothing is packed or copied. On a Zen 5 core, GFLOP/s of this and of the `gemm` crate 0.19 at the
+//! shapes of an update: 128 × 64 × 54 269 and 248, 128 × 32 × 18 246 and 195, 54 × 64 × 128 with A transposed 266 and
+//! 231; there is no pass over C for bias, activation or slope besides.
 #![expect(unsafe_code, reason = "the inner loop reads and writes through pointers; every bound is asserted before it")]
 #![expect(clippy::inline_always, reason = "instructions of a set are only generated in code inlined into its entry")]
 
@@ -268,6 +270,7 @@ mod tests {
             for (row, col) in [(k.max(1) + 3, 1), (1, m + 2)] {
                 let (a, b, bias) = (draw(m * row + k * col), draw(k * n), draw(n));
                 let (c, y) = (draw(m * n), draw(m * n));
+                let mut bits = std::collections::BTreeMap::new();
                 for level in Level::available() {
                     for (at, finish) in [
                         Finish::Set,
@@ -281,6 +284,10 @@ mod tests {
                         let mut found = c.clone();
                         let a = Left { data: &a, row, col };
                         level.run(Product { size: [m, n, k], a, b: &b, c: &mut found, finish });
+                        // sixteen lanes or eight: the same bits
+                        if level != Level::Portable {
+                            assert_eq!(bits.entry(at).or_insert_with(|| found.clone()), &found);
+                        }
                         for i in 0..m {
                             for j in 0..n {
                                 let term = |p: usize| f64::from(a.data[i * row + p * col]) * f64::from(b[p * n + j]);

@@ -1,7 +1,8 @@
 //! Vectors of `f32`: AVX-512, AVX2 with FMA, or plain arrays of four, chosen once at run time.
 //!
 //! A kernel is an [`Operation`]: generic over [`Simd`], compiled once per instruction set. Its body must be
-//! `#[inline(always)]`, or the compiler cannot use the set's instructions in it.
+//! `#[inline(always)]`, or the compiler cannot use the set's instructions in it. Every sum runs in an order that does
+//! not depend on the width, so AVX-512 and AVX2 give the same bits; portable code rounds products apart.
 #![expect(unsafe_code, reason = "processor intrinsics; a vector type exists only where its instructions were detected")]
 #![expect(clippy::inline_always, reason = "instructions of a set are only generated in code inlined into its entry")]
 
@@ -133,14 +134,17 @@ pub(crate) trait Simd: Copy {
         self.sub(self.add(v, magic), magic)
     }
 
-    /// The sum of all lanes, in pairs at distance 1, then 2, and so on.
+    /// The sum of sixteen lanes in as many vectors as they take (the first of the four), in pairs at distance 1, then 2,
+    /// 4 and 8: the same order whatever the width.
     #[inline(always)]
-    fn sum(self, v: Self::V) -> f32 {
+    fn sum16(self, vectors: [Self::V; 4]) -> f32 {
         let mut lanes = [0.0; LANES];
-        self.store(&mut lanes, v);
+        for (lanes, v) in lanes.chunks_exact_mut(Self::WIDTH).zip(vectors) {
+            self.store(lanes, v);
+        }
         let mut distance = 1;
-        while distance < Self::WIDTH {
-            for at in (0..Self::WIDTH).step_by(2 * distance) {
+        while distance < LANES {
+            for at in (0..LANES).step_by(2 * distance) {
                 lanes[at] += lanes[at + distance];
             }
             distance *= 2;

@@ -205,11 +205,14 @@ impl Operation for Dots<'_> {
         assert!(stride.is_multiple_of(LANES));
         for (x, y) in x.chunks_exact(stride).zip(y.chunks_exact_mut(bias.len())) {
             for ((y, w), bias) in y.iter_mut().zip(w.chunks_exact(stride)).zip(bias) {
-                let mut sum = s.splat(0.0);
-                for (x, w) in x.chunks_exact(S::WIDTH).zip(w.chunks_exact(S::WIDTH)) {
-                    sum = s.fma(s.load(x), s.load(w), sum);
+                let mut sums = [s.splat(0.0); 4];
+                for (x, w) in x.chunks_exact(LANES).zip(w.chunks_exact(LANES)) {
+                    for part in 0..LANES / S::WIDTH {
+                        let (x, w) = (s.load(&x[part * S::WIDTH..]), s.load(&w[part * S::WIDTH..]));
+                        sums[part] = s.fma(x, w, sums[part]);
+                    }
                 }
-                *y = s.sum(sum) + bias;
+                *y = s.sum16(sums) + bias;
             }
         }
     }

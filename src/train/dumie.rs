@@ -284,6 +284,7 @@ fn link(n: usize, j: usize, i: usize) -> usize {
 mod tests {
     use super::*;
     use crate::schema::{AgentSpec, Controller, Matrix};
+    use crate::train::config::Negatives;
 
     fn layout() -> Layout {
         let agent = |name: &str| AgentSpec {

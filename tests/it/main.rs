@@ -9,6 +9,7 @@ mod extracts;
 mod figures;
 mod fuzz;
 mod integrity;
+mod learner;
 mod links;
 mod mi;
 mod record;
