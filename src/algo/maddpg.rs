@@ -9,12 +9,16 @@
 //! 4. targets: θ⁻ ← (1 − τ) θ⁻ + τ θ.
 //!
 //! Source: Lowe et al. 2017; the joint step and the constants are those of the paper's parent code (one critic, one
-//! actor loss). Link bits are those drawn at rollout, `ι_t` for o and ι_{t+1} for o'.
+//! actor loss). Lowe's own step, actor i's action alone from its policy and the others' from replay, is
+//! [`ActorStep::PerAgent`]. Link bits are those drawn at rollout, `ι_t` for o and ι_{t+1} for o'.
+//!
+//! The batch goes through in tiles of 128 rows, each through every network before the next, so that activations stay
+//! in the second-level cache.
 
 use serde::{Deserialize, Serialize};
 
-use super::Actors;
-use crate::nn::{Activation, Adam, AdamConfig, Mlp, NnError, Params, Tape, clip_norm, soft_update};
+use super::{Actors, Team};
+use crate::nn::{Activation, Adam, AdamConfig, Input, Mlp, NnError, Packed, Params, Passes, TILE, clip_norm};
 use crate::rng::Seeds;
 use crate::schema::AgentSpec;
 
@@ -41,6 +45,10 @@ pub struct MaddpgConfig {
     pub action_penalty: f32,
     /// Whether messages enter the actors: "observation" (the sender's) or "off".
     pub messages: Messages,
+    /// Whose actions are fresh in the actors' loss: "joint" or "per-agent".
+    pub actor_step: ActorStep,
+    /// Which link bits a minibatch sees: "kept" from the rollout, or "redrawn".
+    pub masks: Masks,
 }
 
 /// What a message is.
@@ -51,6 +59,28 @@ pub enum Messages {
     Observation,
     /// Actors have no message inputs at all.
     Off,
+}
+
+/// Whose actions are fresh in the actors' loss.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ActorStep {
+    /// Everybody's: one pass through the critic (the paper's parent code).
+    Joint,
+    /// Only that of the actor at hand, the others' come from replay: one pass through the critic per actor (Lowe et
+    /// al. 2017).
+    PerAgent,
+}
+
+/// Which link bits a minibatch sees.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Masks {
+    /// Those drawn at rollout, `ι_t` for o and ι_{t+1} for o'.
+    Kept,
+    /// Those of another transition drawn from replay, the same for o and o' (as in Message-Dropout, for any prior):
+    /// the prior's law, but independent of where the agents are.
+    Redrawn,
 }
 
 impl MaddpgConfig {
@@ -70,6 +100,8 @@ impl Default for MaddpgConfig {
             grad_clip: 0.5,
             action_penalty: 1e-6,
             messages: Messages::Observation,
+            actor_step: ActorStep::Joint,
+            masks: Masks::Kept,
         }
     }
 }
@@ -150,12 +182,16 @@ pub struct Networks {
     pub target_critic: Params,
 }
 
-/// Buffers that updates reuse.
+/// Networks laid out for the kernels, and buffers; reused, so that updates allocate nothing once they are warm.
 #[derive(Debug, Default)]
 struct Scratch {
-    joint: Vec<f32>,
     team: Team,
-    critic_tape: Tape,
+    target_team: Team,
+    critic: Packed,
+    target_critic: Packed,
+    critic_packed_grads: Packed,
+    passes: Passes,
+    joint: Vec<f32>,
     grad_q: Vec<f32>,
     grad_joint: Vec<f32>,
     grad_action: Vec<f32>,
@@ -204,31 +240,19 @@ impl Maddpg {
     /// # Errors
     /// [`NnError`] when candle refuses.
     pub fn update(&mut self, batch: &Batch, bonus: &[f32]) -> Result<UpdateMetrics, NnError> {
-        let (rows, widths) = (batch.rows, Widths::of(&self.actors));
+        // 1. and 2. target and critic; its target follows at once, since nothing reads it before the next update
+        let [td_loss, q_mean] = self.td_pass(batch, bonus, true);
+        let grads = &mut self.scratch.critic_grads;
+        grads.clear();
+        grads.resize(self.critic.parameters(), 0.0);
+        self.critic.unpack_grads(&self.scratch.critic_packed_grads, grads);
+        let critic_grad_norm = clip_norm(grads, self.config.grad_clip);
+        follow(&mut self.critic_adam, &self.params.critic, &self.params.target_critic, grads, self.config.tau)?;
 
-        // 1. and 2. target and critic
-        let [td_loss, q_mean] = self.td_errors(batch, bonus);
-        let Scratch { joint, critic_tape, grad_q, critic_grads, .. } = &mut self.scratch;
-        for error in grad_q.iter_mut() {
-            *error *= 2.0 / rows as f32;
-        }
-        let critic_params = self.params.critic.read();
-        critic_grads.clear();
-        critic_grads.resize(critic_params.len(), 0.0);
-        self.critic.backward(&critic_params, joint, critic_tape, grad_q, critic_grads, None);
-        drop(critic_params);
-        let critic_grad_norm = clip_norm(critic_grads, self.config.grad_clip);
-        let adam = &mut self.critic_adam;
-        self.params.critic.update(|p| adam.step(p, critic_grads))?;
-
-        // 3. actors, jointly, through the critic just updated
-        let (actor_objective, actor_grad_norm) = self.actor_step(batch, widths)?;
-
-        // 4. targets
-        let tau = self.config.tau;
-        let (actors, critic) = (self.params.actors.read(), self.params.critic.read());
-        self.params.target_actors.update(|t| soft_update(t, &actors, tau))?;
-        self.params.target_critic.update(|t| soft_update(t, &critic, tau))?;
+        // 3. actors, through the critic just updated, and 4. their targets
+        let (actor_objective, actor_grad_norm) = self.actor_pass(batch);
+        let grads = &self.scratch.actor_grads;
+        follow(&mut self.actor_adam, &self.params.actors, &self.params.target_actors, grads, self.config.tau)?;
         Ok(UpdateMetrics {
             td_loss,
             actor_objective,
@@ -240,92 +264,151 @@ impl Maddpg {
 
     /// The mean squared TD error that [`Maddpg::update`] would report for this minibatch and no bonus; learns nothing.
     pub fn td_loss(&mut self, batch: &Batch) -> f64 {
-        self.td_errors(batch, &[])[0]
+        self.td_pass(batch, &[], false)[0]
     }
 
-    /// Q(o, a) − y per row into `scratch.grad_q`, the critic's input and tape left as a backward pass needs them.
-    /// Returns the mean squared error and the mean Q.
-    fn td_errors(&mut self, batch: &Batch, bonus: &[f32]) -> [f64; 2] {
-        let (rows, widths) = (batch.rows, Widths::of(&self.actors));
-        let Scratch { joint, team, critic_tape, grad_q, target, .. } = &mut self.scratch;
-        // y = r + bonus + γ Q⁻(o', π⁻(o', M'))
-        joint_rows(joint, &batch.next_observations, rows, widths);
-        let (observations, link) = (&batch.next_observations, &batch.next_link);
-        team.act(&self.actors, &self.params.target_actors.read(), (observations, link), rows, joint);
-        let next_q = self.critic.forward(&self.params.target_critic.read(), joint, rows, critic_tape);
-        target.clear();
-        target.extend(batch.reward.iter().zip(next_q).map(|(r, q)| r + self.config.gamma * q));
-        target.iter_mut().zip(bonus).for_each(|(y, b)| *y += b);
+    /// Mean (Q(o, a) − y)² and mean Q; with `learn`, the gradient of the former in `scratch.critic_packed_grads`.
+    fn td_pass(&mut self, batch: &Batch, bonus: &[f32], learn: bool) -> [f64; 2] {
+        let widths = Widths::of(&self.actors);
+        let (actors, critic, gamma) = (&self.actors, &self.critic, self.config.gamma);
+        let Scratch {
+            joint,
+            target_team,
+            passes,
+            grad_q,
+            target,
+            critic_packed_grads,
+            critic: packed,
+            target_critic: target_packed,
+            ..
+        } = &mut self.scratch;
+        target_team.load(actors, &self.params.target_actors.read());
+        critic.pack(&self.params.target_critic.read(), target_packed);
+        packed.wanted = widths.observations..widths.joint();
+        critic.pack(&self.params.critic.read(), packed);
+        critic.clear_grads(critic_packed_grads);
+        let (mut squares, mut values) = (0.0, 0.0);
+        for start in (0..batch.rows).step_by(TILE) {
+            let rows = TILE.min(batch.rows - start);
+            let tile = Tile::of(batch, start, rows, widths, actors.len());
+            // y = r + bonus + γ Q⁻(o', π⁻(o', M'))
+            joint.resize(rows * widths.joint(), 0.0);
+            widths.put(joint, tile.next_observations, 0);
+            target_team.act(actors, tile.next_observations, tile.next_link, rows);
+            (0..actors.len()).for_each(|i| widths.put(joint, target_team.actions(i), widths.action(actors, i).start));
+            let q = critic.forward_packed(target_packed, widths.input(joint), rows, passes);
+            target.clear();
+            target.extend(tile.reward.iter().zip(q).map(|(r, q)| r + gamma * q));
+            target.iter_mut().zip(bonus.iter().skip(start)).for_each(|(y, b)| *y += b);
 
-        joint_rows(joint, &batch.observations, rows, widths);
-        put_actions(joint, &batch.actions, widths, widths.actions, widths.observations);
-        let q = self.critic.forward(&self.params.critic.read(), joint, rows, critic_tape);
-        grad_q.clear();
-        grad_q.extend(q.iter().zip(target.iter()).map(|(q, y)| q - y));
-        let squares: f64 = grad_q.iter().map(|&error| f64::from(error) * f64::from(error)).sum();
-        [squares / rows as f64, mean(q)]
-    }
-
-    /// One joint Adam step of all actors; returns mean Q(o, π(o, M)) and the largest gradient norm.
-    fn actor_step(&mut self, batch: &Batch, widths: Widths) -> Result<(f64, f32), NnError> {
-        let rows = batch.rows;
-        let Scratch { joint, team, critic_tape, grad_q, grad_joint, grad_action, actor_grads, .. } = &mut self.scratch;
-        let actor_params = self.params.actors.read();
-        team.act(&self.actors, &actor_params, (&batch.observations, &batch.link), rows, joint);
-        let critic_params = self.params.critic.read();
-        let objective = mean(self.critic.forward(&critic_params, joint, rows, critic_tape));
-        grad_q.clear();
-        grad_q.resize(rows, -1.0 / rows as f32);
-        grad_joint.resize(rows * widths.joint(), 0.0);
-        self.critic.backward(&critic_params, joint, critic_tape, grad_q, &mut [], Some(grad_joint));
-        drop(critic_params);
-        actor_grads.clear();
-        actor_grads.resize(actor_params.len(), 0.0);
-        let penalty = 2.0 * self.config.action_penalty / (rows * widths.actions) as f32;
-        let mut norm = 0.0f32;
-        for i in 0..self.actors.len() {
-            let width = self.actors.networks[i].outputs();
-            let at = widths.action_offset(&self.actors, i);
-            grad_action.clear();
-            for (grad, row) in grad_joint.chunks_exact(widths.joint()).zip(team.tapes[i].output().chunks_exact(width)) {
-                grad_action.extend(grad[at..at + width].iter().zip(row).map(|(g, a)| g + penalty * a));
+            widths.put(joint, tile.observations, 0);
+            widths.put(joint, tile.actions, widths.observations);
+            let q = critic.forward_packed(packed, widths.input(joint), rows, passes);
+            grad_q.clear();
+            for (q, y) in q.iter().zip(&*target) {
+                let error = q - y;
+                squares += f64::from(error) * f64::from(error);
+                values += f64::from(*q);
+                grad_q.push(error * 2.0 / batch.rows as f32);
             }
-            let grads = &mut actor_grads[self.actors.offsets[i]..self.actors.offsets[i + 1]];
-            let params = self.actors.slice(&actor_params, i);
-            self.actors.networks[i].backward(params, &team.inputs[i], &mut team.tapes[i], grad_action, grads, None);
+            if learn {
+                let grads = Some(&mut *critic_packed_grads);
+                critic.backward_packed(packed, widths.input(joint), rows, passes, grad_q, grads, None);
+            }
+        }
+        [squares / batch.rows as f64, values / batch.rows as f64]
+    }
+
+    /// Mean Q(o, π(o, M)) and the largest gradient norm of an actor; clipped gradients in `scratch.actor_grads`.
+    fn actor_pass(&mut self, batch: &Batch) -> (f64, f32) {
+        let widths = Widths::of(&self.actors);
+        let (actors, critic) = (&self.actors, &self.critic);
+        let Scratch {
+            joint, team, passes, grad_q, grad_joint, grad_action, actor_grads, critic: packed, ..
+        } = &mut self.scratch;
+        team.load(actors, &self.params.actors.read());
+        team.clear_grads(actors);
+        critic.pack(&self.params.critic.read(), packed);
+        // whose actions are fresh, in each pass through the critic
+        let n = actors.len();
+        let (passes_needed, fresh_in_each) = match self.config.actor_step {
+            ActorStep::Joint => (1, n),
+            ActorStep::PerAgent => (n, 1),
+        };
+        let mut objective = 0.0;
+        for start in (0..batch.rows).step_by(TILE) {
+            let rows = TILE.min(batch.rows - start);
+            let tile = Tile::of(batch, start, rows, widths, n);
+            team.act(actors, tile.observations, tile.link, rows);
+            joint.resize(rows * widths.joint(), 0.0);
+            widths.put(joint, tile.observations, 0);
+            grad_q.clear();
+            grad_q.resize(rows, -1.0 / batch.rows as f32);
+            grad_joint.resize(rows * widths.actions, 0.0);
+            for pass in 0..passes_needed {
+                let fresh = pass..pass + fresh_in_each;
+                if fresh.len() < n {
+                    widths.put(joint, tile.actions, widths.observations);
+                }
+                for i in fresh.clone() {
+                    widths.put(joint, team.actions(i), widths.action(actors, i).start);
+                }
+                let input = widths.input(joint);
+                let q = critic.forward_packed(packed, input, rows, passes);
+                objective += q.iter().map(|&q| f64::from(q)).sum::<f64>();
+                critic.backward_packed(packed, input, rows, passes, grad_q, None, Some(grad_joint));
+                for i in fresh {
+                    let columns = widths.action(actors, i);
+                    let (from, width) = (columns.start - widths.observations, columns.len());
+                    let penalised = if fresh_in_each == n { widths.actions } else { width };
+                    let penalty = 2.0 * self.config.action_penalty / (batch.rows * penalised) as f32;
+                    grad_action.clear();
+                    let own = grad_joint.chunks_exact(widths.actions).zip(team.actions(i).chunks_exact(width));
+                    for (grad, a) in own {
+                        grad_action.extend(grad[from..from + width].iter().zip(a).map(|(g, a)| g + penalty * a));
+                    }
+                    team.backward(actors, i, tile.observations, rows, grad_action);
+                }
+            }
+        }
+        actor_grads.resize(actors.parameters(), 0.0);
+        let mut norm = 0.0f32;
+        for i in 0..n {
+            let grads = &mut actor_grads[actors.offsets[i]..actors.offsets[i + 1]];
+            team.grads(actors, i, grads);
             norm = norm.max(clip_norm(grads, self.config.grad_clip));
         }
-        drop(actor_params);
-        let adam = &mut self.actor_adam;
-        self.params.actors.update(|p| adam.step(p, actor_grads))?;
-        Ok((objective, norm))
+        (objective / (batch.rows * passes_needed) as f64, norm)
     }
 }
 
-/// Buffers in which a team acts on a whole batch: each actor's inputs and tape stay for a backward pass.
-#[derive(Debug, Default)]
-struct Team {
-    inputs: Vec<Vec<f32>>,
-    tapes: Vec<Tape>,
+/// One Adam step of `online`, and `target`'s step towards it.
+fn follow(adam: &mut Adam, online: &Params, target: &Params, grads: &[f32], tau: f32) -> Result<(), NnError> {
+    let mut moved = Ok(());
+    online.update(|params| moved = target.update(|target| adam.step_and_follow(params, grads, target, tau)))?;
+    moved
 }
 
-impl Team {
-    /// Lays the actions of all actors on `[rows, O]` observations under `[rows, N²]` link bits into the critic's input.
-    fn act(
-        &mut self,
-        actors: &Actors,
-        params: &[f32],
-        (observations, link): (&[f32], &[bool]),
-        rows: usize,
-        joint: &mut [f32],
-    ) {
-        let widths = Widths::of(actors);
-        self.inputs.resize_with(actors.len(), Vec::new);
-        self.tapes.resize_with(actors.len(), Tape::default);
-        for (i, (input, tape)) in self.inputs.iter_mut().zip(self.tapes.iter_mut()).enumerate() {
-            actor_inputs(actors, i, observations, link, rows, input);
-            let actions = actors.act(params, i, input, rows, tape);
-            put_actions(joint, actions, widths, actors.networks[i].outputs(), widths.action_offset(actors, i));
+/// Consecutive rows of a batch.
+struct Tile<'a> {
+    observations: &'a [f32],
+    next_observations: &'a [f32],
+    actions: &'a [f32],
+    link: &'a [bool],
+    next_link: &'a [bool],
+    reward: &'a [f32],
+}
+
+impl<'a> Tile<'a> {
+    fn of(batch: &'a Batch, start: usize, rows: usize, widths: Widths, learners: usize) -> Self {
+        let [o, a, l] = [widths.observations, widths.actions, learners * learners].map(|w| start * w..(start + rows) * w);
+        Self {
+            observations: &batch.observations[o.clone()],
+            next_observations: &batch.next_observations[o],
+            actions: &batch.actions[a],
+            link: &batch.link[l.clone()],
+            next_link: &batch.next_link[l],
+            reward: &batch.reward[start..start + rows],
         }
     }
 }
@@ -346,37 +429,22 @@ impl Widths {
         self.observations + self.actions
     }
 
-    fn action_offset(self, actors: &Actors, i: usize) -> usize {
-        self.observations + actors.networks[..i].iter().map(Mlp::outputs).sum::<usize>()
+    /// Columns of actor `i`'s action in the critic's input.
+    fn action(self, actors: &Actors, i: usize) -> std::ops::Range<usize> {
+        let start = self.observations + actors.networks[..i].iter().map(Mlp::outputs).sum::<usize>();
+        start..start + actors.networks[i].outputs()
     }
-}
 
-fn mean(values: &[f32]) -> f64 {
-    values.iter().map(|&v| f64::from(v)).sum::<f64>() / values.len() as f64
-}
-
-/// Lays the observations into the critic's input rows; actions follow by [`put_actions`].
-fn joint_rows(joint: &mut Vec<f32>, observations: &[f32], rows: usize, widths: Widths) {
-    joint.resize(rows * widths.joint(), 0.0);
-    for (row, o) in joint.chunks_exact_mut(widths.joint()).zip(observations.chunks_exact(widths.observations)) {
-        row[..widths.observations].copy_from_slice(o);
+    /// Lays rows into the critic's input rows, from column `at`.
+    fn put(self, joint: &mut [f32], rows: &[f32], at: usize) {
+        let width = rows.len() * self.joint() / joint.len();
+        for (to, from) in joint.chunks_exact_mut(self.joint()).zip(rows.chunks_exact(width)) {
+            to[at..at + width].copy_from_slice(from);
+        }
     }
-}
 
-/// Lays `[rows, width]` actions into the critic's input rows, from column `at`.
-fn put_actions(joint: &mut [f32], actions: &[f32], widths: Widths, width: usize, at: usize) {
-    for (row, a) in joint.chunks_exact_mut(widths.joint()).zip(actions.chunks_exact(width)) {
-        row[at..at + width].copy_from_slice(a);
-    }
-}
-
-/// Inputs of actor `i` for all rows of a batch.
-fn actor_inputs(actors: &Actors, i: usize, observations: &[f32], link: &[bool], rows: usize, out: &mut Vec<f32>) {
-    let (width, n) = (actors.observation.iter().sum::<usize>(), actors.len());
-    out.clear();
-    for row in 0..rows {
-        let bits = &link[row * n * n..(row + 1) * n * n];
-        actors.push_input(i, &observations[row * width..(row + 1) * width], bits, out);
+    fn input(self, joint: &[f32]) -> Input<'_> {
+        Input { data: joint, stride: self.joint() }
     }
 }
 
@@ -449,46 +517,87 @@ mod tests {
         assert!((a.td_loss - b.td_loss).abs() < 1e-4 && a.td_loss > 1.0);
     }
 
+    /// What the actors climb, from the definition and one network at a time: mean Q with the actions of `fresh` actors
+    /// from their policies and the others' from the batch.
+    fn objective(learner: &Maddpg, batch: &Batch, fresh: &[usize]) -> f64 {
+        let (mut joint, mut input) = (Vec::new(), Vec::new());
+        let mut tape = crate::nn::Tape::default();
+        for row in 0..batch.rows {
+            let observations = &batch.observations[row * 7..(row + 1) * 7];
+            joint.extend_from_slice(observations);
+            for i in 0..2 {
+                if fresh.contains(&i) {
+                    input.clear();
+                    learner.actors.push_input(i, observations, &batch.link[row * 4..], &mut input);
+                    let params = learner.params.actors.read();
+                    joint.extend_from_slice(learner.actors.act(&params, i, &input, 1, &mut tape));
+                } else {
+                    joint.extend_from_slice(&batch.actions[row * 4 + 2 * i..row * 4 + 2 * i + 2]);
+                }
+            }
+        }
+        let q = learner.critic.forward(&learner.params.critic.read(), &joint, batch.rows, &mut tape);
+        q.iter().map(|&q| f64::from(q)).sum::<f64>() / batch.rows as f64
+    }
+
     #[test]
-    fn the_joint_actor_gradient_equals_finite_differences() {
+    fn actor_gradients_equal_finite_differences_jointly_and_one_by_one() {
         let agents = agents(2);
         let agents: Vec<&AgentSpec> = agents.iter().collect();
-        let config = MaddpgConfig { grad_clip: f32::INFINITY, action_penalty: 0.0, ..MaddpgConfig::default() };
-        let mut learner = Maddpg::new(&agents, Activation::Sigmoid, config, &Seeds::new(4)).unwrap();
-        let batch = batch(32);
-        let widths = Widths::of(&learner.actors);
-        let objective = |learner: &Maddpg| {
-            let (mut joint, mut input, mut tape) = (Vec::new(), Vec::new(), Tape::default());
-            joint_rows(&mut joint, &batch.observations, 32, widths);
-            for i in 0..2 {
-                actor_inputs(&learner.actors, i, &batch.observations, &batch.link, 32, &mut input);
-                let a = learner.actors.act(&learner.params.actors.read(), i, &input, 32, &mut tape);
-                put_actions(&mut joint, a, widths, 2, widths.action_offset(&learner.actors, i));
-            }
-            mean(learner.critic.forward(&learner.params.critic.read(), &joint, 32, &mut tape))
-        };
-        joint_rows(&mut learner.scratch.joint, &batch.observations, 32, widths);
-        let start = learner.params.actors.read().to_vec();
-        learner.actor_step(&batch, widths).unwrap();
-        let grads = learner.scratch.actor_grads.clone();
-        // both actors' first weights and last biases, and the steepest coordinate
-        let steepest = (0..grads.len()).max_by(|&a, &b| grads[a].abs().total_cmp(&grads[b].abs())).unwrap();
-        for at in [0, learner.actors.offsets[1], learner.actors.offsets[1] - 1, grads.len() - 1, steepest] {
-            let mut values = [0.0; 2];
-            for (value, step) in values.iter_mut().zip([1e-3f32, -1e-3]) {
-                learner
-                    .params
-                    .actors
-                    .update(|p| {
+        let batch = batch(150);
+        for actor_step in [ActorStep::Joint, ActorStep::PerAgent] {
+            let config =
+                MaddpgConfig { grad_clip: f32::INFINITY, action_penalty: 0.0, actor_step, ..MaddpgConfig::default() };
+            let mut learner = Maddpg::new(&agents, Activation::Sigmoid, config, &Seeds::new(4)).unwrap();
+            learner.td_pass(&batch, &[], false);
+            let (found, _) = learner.actor_pass(&batch);
+            let groups: &[&[usize]] =
+                if actor_step == ActorStep::Joint { &[&[0, 1], &[0, 1]] } else { &[&[0], &[1]] };
+            let mean = groups.iter().map(|fresh| objective(&learner, &batch, fresh)).sum::<f64>() / 2.0;
+            assert!((found - mean).abs() < 1e-6, "{found} and {mean}");
+            let start = learner.params.actors.read().to_vec();
+            let grads = learner.scratch.actor_grads.clone();
+            // both actors' first weights and last biases, a weight of a received message, and the steepest coordinate
+            let steepest = (0..grads.len()).max_by(|&a, &b| grads[a].abs().total_cmp(&grads[b].abs())).unwrap();
+            let second = learner.actors.offsets[1];
+            for at in [0, 5, second, second - 1, second + 6, grads.len() - 1, steepest] {
+                let mut values = [0.0; 2];
+                for (value, step) in values.iter_mut().zip([1e-2f32, -1e-2]) {
+                    let move_one = |p: &mut [f32]| {
                         p.copy_from_slice(&start);
                         p[at] += step;
-                    })
-                    .unwrap();
-                *value = objective(&learner);
+                    };
+                    learner.params.actors.update(move_one).unwrap();
+                    *value = objective(&learner, &batch, groups[usize::from(at >= second)]);
+                }
+                let slope = -(values[0] - values[1]) / 2e-2;
+                let error = (slope - f64::from(grads[at])).abs();
+                assert!(error < 1e-5 + 0.02 * slope.abs(), "{at}: {slope} against {}, {actor_step:?}", grads[at]);
             }
-            let slope = -(values[0] - values[1]) / 2e-3;
-            let error = (slope - f64::from(grads[at])).abs();
-            assert!(error < 1e-5 + 0.02 * slope.abs(), "{at}: {slope} against {}", grads[at]);
         }
+    }
+
+    #[test]
+    fn the_critics_gradient_equals_finite_differences_of_its_loss() {
+        let agents = agents(2);
+        let config = MaddpgConfig::default();
+        let mut learner =
+            Maddpg::new(&agents.iter().collect::<Vec<_>>(), Activation::Tanh, config, &Seeds::new(4)).unwrap();
+        let batch = batch(300);
+        learner.td_pass(&batch, &[], true);
+        let mut grads = vec![0.0; learner.critic.parameters()];
+        learner.critic.unpack_grads(&learner.scratch.critic_packed_grads, &mut grads);
+        let square: f64 = grads.iter().map(|&g| f64::from(g) * f64::from(g)).sum();
+        let start = learner.params.critic.read().to_vec();
+        let h = 1e-2 / square.sqrt();
+        let mut at = |h: f64| {
+            let moved = |p: &mut [f32]| {
+                p.iter_mut().zip(&start).zip(&grads).for_each(|((p, s), g)| *p = s + (h * f64::from(*g)) as f32);
+            };
+            learner.params.critic.update(moved).unwrap();
+            learner.td_loss(&batch)
+        };
+        let slope = (at(h) - at(-h)) / (2.0 * h);
+        assert!((slope / square - 1.0).abs() < 1e-2, "{slope} against {square}");
     }
 }

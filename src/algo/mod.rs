@@ -6,10 +6,12 @@
 mod actors;
 mod maddpg;
 mod presets;
+mod team;
 
 pub use actors::{Actors, RunPolicyError};
-pub use maddpg::{Batch, Maddpg, MaddpgConfig, UpdateMetrics};
+pub use maddpg::{ActorStep, Batch, Maddpg, MaddpgConfig, Masks, Messages, UpdateMetrics};
 pub use presets::Preset;
+pub use team::Team;
 
 use crate::registry::{Entry, RegistryError};
 

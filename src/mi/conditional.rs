@@ -142,7 +142,7 @@ mod tests {
             let mut tape = ConditionalTape::default();
             q.forward(&params, &[1e3, -1e3], 2, &mut tape);
             assert!(tape.logvar().iter().all(|v| v.abs() <= limit));
-            assert_eq!(tape.logvar()[0], limit);
+            assert!(tape.logvar()[0] > 0.999_999 * limit);
         }
     }
 }

@@ -92,8 +92,11 @@ pub fn club_values(mu: &[f32], logvar: &[f32], y: &[f32], negatives: &[u32], val
 pub fn nll(mu: &[f32], logvar: &[f32], y: &[f32], n: usize, grad_mu: &mut [f32], grad_logvar: &mut [f32]) -> f64 {
     let scale = 1.0 / n as f32;
     let mut total = 0.0;
+    // 1/σ² stands where its gradient will
+    grad_logvar.iter_mut().zip(logvar).for_each(|(to, logvar)| *to = -logvar);
+    crate::nn::exp_in_place(grad_logvar);
     for i in 0..y.len() {
-        let (error, precision) = (mu[i] - y[i], (-logvar[i]).exp());
+        let (error, precision) = (mu[i] - y[i], grad_logvar[i]);
         let square = error * error * precision;
         grad_mu[i] = scale * error * precision;
         grad_logvar[i] = 0.5 * scale * (1.0 - square);

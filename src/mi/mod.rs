@@ -8,6 +8,7 @@
 //! `interval` (episodes as blocks), `null` (whole episodes permuted), `part` (parts of the samples by whole episodes),
 //! `run` (all jobs in parallel); and arithmetic: `linear` (covariances), `knn` and `neighbours`, `counts`.
 
+pub(crate) mod all_pairs;
 mod club;
 pub mod conditional;
 mod counts;
@@ -31,6 +32,7 @@ mod null;
 mod part;
 mod prepare;
 mod run;
+pub(crate) mod shifted;
 
 pub use estimate::{Estimate, Kind, Unit, is_estimates, to_csv, to_json, to_parquet};
 pub use interval::{Interval, block_interval};

@@ -1,18 +1,13 @@
-//! A multilayer perceptron: its shape, its forward pass and its backward pass.
+//! A multilayer perceptron: its shape, its parameters, and its passes over dense rows.
 //!
 //! Parameters live outside, in one flat slice: per layer the weight `[outputs, inputs]` then the bias `[outputs]`
-//! (`PyTorch`'s layout). Rows go through all layers tile by tile, so that a tile stays in cache.
+//! (`PyTorch`'s layout). The passes themselves are in `passes`; whoever keeps parameters for many passes packs them
+//! once ([`Mlp::pack`]) and uses those directly.
 
 use rand::Rng;
 
-use super::product::{View, multiply};
+use super::passes::{Input, Packed, Passes};
 use crate::rng;
-
-/// Rows that go through all layers together: 256 × 64 floats are 64 KiB, half of a small L2.
-const TILE: usize = 256;
-
-/// Narrow outputs are computed this wide: `gemm` drops from about 135 to 12 GFLOP/s at an output width of 2.
-const NARROW: usize = 16;
 
 /// What a layer does to its sums.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -30,18 +25,18 @@ pub enum Activation {
 }
 
 impl Activation {
-    fn apply(self, z: f32) -> f32 {
+    /// The factor below zero, where the function is a line on either side of it.
+    pub(super) fn leak(self) -> Option<f32> {
         match self {
-            Self::Identity => z,
-            Self::Relu => z.max(0.0),
-            Self::LeakyRelu => z.max(0.01 * z),
-            Self::Tanh => z.tanh(),
-            Self::Sigmoid => 1.0 / (1.0 + (-z).exp()),
+            Self::Identity => Some(1.0),
+            Self::Relu => Some(0.0),
+            Self::LeakyRelu => Some(0.01),
+            Self::Tanh | Self::Sigmoid => None,
         }
     }
 
     /// Derivative, from the activated value.
-    fn slope(self, y: f32) -> f32 {
+    pub(super) fn slope(self, y: f32) -> f32 {
         match self {
             Self::Identity => 1.0,
             Self::Relu => f32::from(u8::from(y > 0.0)),
@@ -69,24 +64,17 @@ pub struct Mlp {
 /// What a forward pass leaves for the backward pass; reused, so that passes allocate nothing once it is warm.
 #[derive(Clone, Debug, Default)]
 pub struct Tape {
-    activations: Vec<Vec<f32>>,
+    passes: Passes,
+    packed: Packed,
+    grads: Packed,
     rows: usize,
-    padded_weight: Vec<f32>,
-    padded_rows: Vec<f32>,
-    padded_grad: Vec<f32>,
-    deltas: [Vec<f32>; 2],
 }
 
 impl Tape {
     /// Output of the last forward pass, `[rows, outputs]`.
     pub fn output(&self) -> &[f32] {
-        self.activations.last().map_or(&[], |a| a)
+        self.passes.output()
     }
-}
-
-fn grow(buffer: &mut Vec<f32>, len: usize) -> &mut [f32] {
-    buffer.resize(len, 0.0);
-    buffer
 }
 
 impl Mlp {
@@ -125,7 +113,8 @@ impl Mlp {
         self.widths.windows(2).map(|w| w[1] * (w[0] + 1)).sum()
     }
 
-    fn activation(&self, layer: usize) -> Activation {
+    /// What layer `layer` does to its sums.
+    pub(super) fn activation(&self, layer: usize) -> Activation {
         if layer + 1 == self.layers() { self.output } else { self.hidden }
     }
 
@@ -143,59 +132,15 @@ impl Mlp {
     /// # Panics
     /// When a slice is shorter than its shape.
     pub fn forward<'t>(&self, params: &[f32], input: &[f32], rows: usize, tape: &'t mut Tape) -> &'t [f32] {
-        assert!(params.len() >= self.parameters() && input.len() >= rows * self.inputs());
+        self.pack_forward(params, &mut tape.packed);
         tape.rows = rows;
-        tape.activations.resize_with(self.layers(), Vec::new);
-        for layer in 0..self.layers() {
-            grow(&mut tape.activations[layer], rows * self.widths[layer + 1]);
-        }
-        for start in (0..rows).step_by(TILE) {
-            let tile = start..rows.min(start + TILE);
-            for layer in 0..self.layers() {
-                self.forward_layer(params, input, layer, tile.clone(), tape);
-            }
-        }
-        tape.output()
-    }
-
-    fn forward_layer(
-        &self,
-        params: &[f32],
-        input: &[f32],
-        layer: usize,
-        tile: std::ops::Range<usize>,
-        tape: &mut Tape,
-    ) {
-        let ([outputs, inputs], offset) = self.weight(layer);
-        let (rows, activation) = (tile.len(), self.activation(layer));
-        let weight = &params[offset..offset + outputs * inputs];
-        let bias = &params[offset + outputs * inputs..offset + outputs * (inputs + 1)];
-        let (before, after) = tape.activations.split_at_mut(layer);
-        let x = before.last().map_or(input, |a| a.as_slice());
-        let x = View::new(&x[tile.start * inputs..tile.end * inputs], rows, inputs);
-        let y = &mut after[0][tile.start * outputs..tile.end * outputs];
-        if outputs < NARROW {
-            let wide = grow(&mut tape.padded_weight, NARROW * inputs);
-            wide[..outputs * inputs].copy_from_slice(weight);
-            wide[outputs * inputs..].fill(0.0);
-            let sums = grow(&mut tape.padded_rows, rows * NARROW);
-            multiply(x, View::new(wide, NARROW, inputs).t(), sums, false);
-            for (sum, y) in sums.chunks_exact(NARROW).zip(y.chunks_exact_mut(outputs)) {
-                y.copy_from_slice(&sum[..outputs]);
-            }
-        } else {
-            multiply(x, View::new(weight, outputs, inputs).t(), y, false);
-        }
-        match activation {
-            Activation::Relu => finish(y, bias, |z| z.max(0.0)),
-            Activation::LeakyRelu => finish(y, bias, |z| z.max(0.01 * z)),
-            other => finish(y, bias, |z| other.apply(z)),
-        }
+        self.forward_packed(&tape.packed, self.dense(input), rows, &mut tape.passes)
     }
 
     /// Backward pass of the forward pass in `tape`: adds ∂L/∂params to `grads` and writes ∂L/∂input to `grad_input`.
     ///
-    /// `grad_output` is ∂L/∂output, `[rows, outputs]`; `grads` has one element per parameter (empty: not wanted).
+    /// `params` and `input` are those of the forward pass; `grad_output` is ∂L/∂output, `[rows, outputs]`; `grads` has
+    /// one element per parameter (empty: not wanted).
     ///
     /// # Panics
     /// When a slice does not have its shape.
@@ -206,90 +151,24 @@ impl Mlp {
         tape: &mut Tape,
         grad_output: &[f32],
         grads: &mut [f32],
-        mut grad_input: Option<&mut [f32]>,
+        grad_input: Option<&mut [f32]>,
     ) {
-        let (rows, layers) = (tape.rows, self.layers());
-        assert!(grad_output.len() >= rows * self.outputs());
+        let Tape { passes, packed, grads: packed_grads, rows } = tape;
         assert!(grads.is_empty() || grads.len() == self.parameters());
-        let [mut delta, mut next] = std::mem::take(&mut tape.deltas);
-        for start in (0..rows).step_by(TILE) {
-            let end = rows.min(start + TILE);
-            let n = end - start;
-            for layer in (0..layers).rev() {
-                let ([outputs, inputs], offset) = self.weight(layer);
-                let y = &tape.activations[layer][start * outputs..end * outputs];
-                // delta = ∂L/∂(sums of this layer), padded to a width that the product likes
-                let width = if outputs < NARROW { NARROW } else { outputs };
-                let activation = self.activation(layer);
-                if layer + 1 == layers {
-                    let given = &grad_output[start * outputs..end * outputs];
-                    let delta = grow(&mut delta, n * width);
-                    for ((d, g), y) in
-                        delta.chunks_exact_mut(width).zip(given.chunks_exact(outputs)).zip(y.chunks_exact(outputs))
-                    {
-                        for o in 0..outputs {
-                            d[o] = g[o] * activation.slope(y[o]);
-                        }
-                        d[outputs..].fill(0.0);
-                    }
-                } else {
-                    slope_in_place(&mut delta[..n * outputs], y, activation);
-                }
-                let x = if layer == 0 { input } else { &tape.activations[layer - 1] };
-                let x = &x[start * inputs..end * inputs];
-                if !grads.is_empty() {
-                    let (grad_weight, grad_bias) =
-                        grads[offset..offset + outputs * (inputs + 1)].split_at_mut(outputs * inputs);
-                    let d = View::new(&delta, n, width);
-                    if width == outputs {
-                        multiply(d.t(), View::new(x, n, inputs), grad_weight, true);
-                    } else {
-                        let wide = grow(&mut tape.padded_grad, width * inputs);
-                        multiply(d.t(), View::new(x, n, inputs), wide, false);
-                        grad_weight.iter_mut().zip(wide.iter()).for_each(|(g, w)| *g += w);
-                    }
-                    for d in delta[..n * width].chunks_exact(width) {
-                        grad_bias.iter_mut().zip(d).for_each(|(g, d)| *g += d);
-                    }
-                }
-                let target: &mut [f32] = if layer > 0 {
-                    grow(&mut next, n * inputs)
-                } else if let Some(grad_input) = grad_input.as_deref_mut() {
-                    &mut grad_input[start * inputs..end * inputs]
-                } else {
-                    continue;
-                };
-                let weight = &params[offset..offset + outputs * inputs];
-                if width == outputs {
-                    multiply(View::new(&delta, n, width), View::new(weight, outputs, inputs), target, false);
-                } else {
-                    let wide = grow(&mut tape.padded_weight, width * inputs);
-                    wide[..outputs * inputs].copy_from_slice(weight);
-                    wide[outputs * inputs..].fill(0.0);
-                    multiply(View::new(&delta, n, width), View::new(wide, width, inputs), target, false);
-                }
-                if layer > 0 {
-                    std::mem::swap(&mut delta, &mut next);
-                }
-            }
+        self.pack_backward(params, packed);
+        let wanted = (!grads.is_empty()).then(|| {
+            self.clear_grads(packed_grads);
+            &mut *packed_grads
+        });
+        self.backward_packed(packed, self.dense(input), *rows, passes, grad_output, wanted, grad_input);
+        if !grads.is_empty() {
+            self.unpack_grads(packed_grads, grads);
         }
-        tape.deltas = [delta, next];
     }
-}
 
-/// Adds the bias and applies the activation, row by row.
-fn finish(y: &mut [f32], bias: &[f32], activation: impl Fn(f32) -> f32) {
-    for row in y.chunks_exact_mut(bias.len()) {
-        row.iter_mut().zip(bias).for_each(|(y, b)| *y = activation(*y + b));
-    }
-}
-
-/// Multiplies `delta` by the activation's slope at `y`.
-fn slope_in_place(delta: &mut [f32], y: &[f32], activation: Activation) {
-    match activation {
-        Activation::Identity => {}
-        Activation::Relu => delta.iter_mut().zip(y).for_each(|(d, &y)| *d = if y > 0.0 { *d } else { 0.0 }),
-        other => delta.iter_mut().zip(y).for_each(|(d, &y)| *d *= other.slope(y)),
+    /// Rows of inputs one after the other.
+    fn dense<'a>(&self, data: &'a [f32]) -> Input<'a> {
+        Input { data, stride: self.inputs() }
     }
 }
 

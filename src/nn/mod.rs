@@ -1,15 +1,27 @@
 //! Networks: small perceptrons with hand-written forward and backward passes over parameters that candle owns.
 //!
 //! candle's autograd is the reference (tests hold the gradients to 1e-5); on networks of this size it costs several
-//! times the fused passes. All arithmetic runs on the calling thread in a fixed order: the same bytes every time.
+//! times the fused passes. All arithmetic runs on the calling thread in a fixed order: the same bytes every time on
+//! one instruction set, which is chosen at run time ([`Level`]): AVX-512, AVX2 with FMA, or portable code.
 
 mod adam;
+mod kernel;
 mod mlp;
 mod params;
-mod product;
+mod passes;
+mod rows;
+mod simd;
+mod sliding;
+mod vector;
 
-pub use adam::{Adam, AdamConfig, clip_norm, soft_update};
+pub use adam::{Adam, AdamConfig, clip_norm};
 pub use mlp::{Activation, Mlp, Tape};
+pub(crate) use kernel::{Finish, Left, Product};
+pub(crate) use passes::{Input, Packed, Passes, TILE};
+pub use simd::Level;
+pub(crate) use simd::{LANES, Operation, Simd};
+pub(crate) use sliding::{Lines, SlidingDots, SlidingSums};
+pub(crate) use vector::{exp, exp_in_place, ln};
 pub use params::{Params, ParamsRef, from_tensors, to_tensors};
 
 /// What can go wrong with networks and their files.

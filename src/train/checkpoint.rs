@@ -23,8 +23,10 @@ struct Counters {
     update: u64,
     episode: u64,
     replay_pushed: u64,
-    ring_pushed: [u64; 2],
-    adam: [u64; 4],
+    /// Per estimator.
+    ring_pushed: Vec<u64>,
+    /// Steps of the actors' optimiser, of the critic's, then of each estimator's.
+    adam: Vec<u64>,
 }
 
 type Tensors = BTreeMap<String, Tensor>;
@@ -62,18 +64,18 @@ pub(super) fn save(trainer: &Trainer) -> Result<(), TrainError> {
     let candle = |e: candle_core::Error| TrainError::from(crate::nn::NnError::from(e));
     let bits: Vec<u8> = replay.link.iter().map(|&b| u8::from(b)).collect();
     tensors.insert("replay.link".to_owned(), Tensor::from_slice(&bits, bits.len(), &Device::Cpu).map_err(candle)?);
-    let (mut adam, mut ring_pushed) = ([learner.actor_adam.t, learner.critic_adam.t, 0, 0], [0, 0]);
+    let (mut adam, mut ring_pushed) = (vec![learner.actor_adam.t, learner.critic_adam.t], Vec::new());
     if let Some(dumie) = &trainer.dumie {
-        for (at, (name, estimator)) in [("jsd", &dumie.jsd), ("club", &dumie.club)].into_iter().enumerate() {
-            put(&mut tensors, name, &estimator.params.read())?;
+        for (name, estimator) in dumie.named() {
+            put(&mut tensors, &name, &estimator.params.read())?;
             put_adam(&mut tensors, &format!("{name}_adam"), &estimator.adam)?;
             put(&mut tensors, &format!("{name}_ring.messages"), &estimator.ring.messages)?;
             put(&mut tensors, &format!("{name}_ring.actions"), &estimator.ring.actions)?;
             let [messages, actions] = estimator.fresh();
             put(&mut tensors, &format!("{name}_fresh.messages"), messages)?;
             put(&mut tensors, &format!("{name}_fresh.actions"), actions)?;
-            adam[2 + at] = estimator.adam.t;
-            ring_pushed[at] = estimator.ring.pushed;
+            adam.push(estimator.adam.t);
+            ring_pushed.push(estimator.ring.pushed);
         }
     }
     let doubles = |tensors: &mut Tensors, name: &str, values: Vec<f64>| -> Result<(), TrainError> {
@@ -138,6 +140,10 @@ pub(super) fn load(trainer: &mut Trainer) -> Result<(), TrainError> {
         (adam.m, adam.v, adam.t) = (m, v, t);
         Ok(())
     };
+    let names: Vec<String> = trainer.dumie.iter().flat_map(|d| d.named().map(|(name, _)| name)).collect();
+    if counters.adam.len() != 2 + names.len() || counters.ring_pushed.len() != names.len() {
+        return Err(fail("its counters are not those of as many estimators".to_owned()));
+    }
     let learner = &mut trainer.learner;
     params("actors", &learner.params.actors)?;
     params("critic", &learner.params.critic)?;
@@ -160,7 +166,7 @@ pub(super) fn load(trainer: &mut Trainer) -> Result<(), TrainError> {
         )
         .map_err(fail)?;
     if let Some(dumie) = &mut trainer.dumie {
-        for (at, (name, estimator)) in [("jsd", &mut dumie.jsd), ("club", &mut dumie.club)].into_iter().enumerate() {
+        for (at, (name, estimator)) in names.iter().zip(dumie.all_mut()).enumerate() {
             params(name, &estimator.params)?;
             adam(&format!("{name}_adam"), &mut estimator.adam, counters.adam[2 + at])?;
             let ring = Ring {

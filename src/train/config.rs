@@ -110,14 +110,77 @@ pub struct DumieConfig {
     pub start: usize,
     /// Estimator steps per update (k of Algorithm 1).
     pub k: usize,
-    /// Derangements of the action per message.
-    pub negatives: usize,
+    /// Actions that stand for "independent of the message": a number of cyclic shifts per minibatch, or "all".
+    pub negatives: Negatives,
+    /// One estimator of each kind for all links ("shared"), or one per ordered link ("per-link").
+    pub estimators: Estimators,
+    /// What the estimators learn from: their "rings", or all of "replay" by class.
+    pub pairs: PairSource,
     /// Where the shaping is computed.
     pub shaping: Shaping,
     /// What CLUB sees of a lost message.
     pub lost_message: LostMessage,
     /// Whether the JSD value is shifted by 2 ln 2 (design: shifted; the paper prints it unshifted).
     pub jsd_shift: bool,
+}
+
+/// Actions that stand for "independent of the message".
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "NegativesText", into = "NegativesText")]
+pub enum Negatives {
+    /// This many derangements of the minibatch's actions, as cyclic shifts.
+    Count(usize),
+    /// Every action of the minibatch, the parent code's N × N; its own among them for CLUB, not for JSD, as there.
+    All,
+}
+
+/// How [`Negatives`] are written.
+#[derive(Serialize, Deserialize)]
+#[serde(untagged)]
+enum NegativesText {
+    Count(usize),
+    Word(String),
+}
+
+impl TryFrom<NegativesText> for Negatives {
+    type Error = String;
+
+    fn try_from(text: NegativesText) -> Result<Self, String> {
+        match text {
+            NegativesText::Count(count) => Ok(Self::Count(count)),
+            NegativesText::Word(word) if word == "all" => Ok(Self::All),
+            NegativesText::Word(word) => Err(format!("expected a number or \"all\", found {word:?}")),
+        }
+    }
+}
+
+impl From<Negatives> for NegativesText {
+    fn from(negatives: Negatives) -> Self {
+        match negatives {
+            Negatives::Count(count) => Self::Count(count),
+            Negatives::All => Self::Word("all".to_owned()),
+        }
+    }
+}
+
+/// Who shares an estimator.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Estimators {
+    /// All ordered links: one JSD and one CLUB, messages padded to the longest (the paper's θ₁ and θ₂).
+    Shared,
+    /// Nobody: each ordered link has its own two, its own rings, and its own minibatches.
+    PerLink,
+}
+
+/// What the estimators learn from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PairSource {
+    /// The newest pairs of either class (the parent code's two buffers).
+    Rings,
+    /// Pairs of either class drawn from the whole replay (the paper's §3.2.2).
+    Replay,
 }
 
 /// Where the shaping is computed.
@@ -150,7 +213,9 @@ impl Default for DumieConfig {
             batch: 1024,
             start: 500,
             k: 1,
-            negatives: 16,
+            negatives: Negatives::Count(16),
+            estimators: Estimators::Shared,
+            pairs: PairSource::Rings,
             shaping: Shaping::Minibatch,
             lost_message: LostMessage::Sent,
             jsd_shift: true,
@@ -254,7 +319,7 @@ impl TrainConfig {
             weight("dumie.beta", beta),
             rate("dumie.learning_rate", d.learning_rate),
             positive("dumie.ring", d.ring),
-            positive("dumie.negatives", d.negatives),
+            positive("dumie.negatives", if let Negatives::Count(count) = d.negatives { count } else { 1 }),
             positive("dumie.k", d.k),
             ("dumie.batch", d.batch > 1, format!("expected at least 2, found {}", d.batch)),
             (

@@ -2,25 +2,25 @@
 //!
 //! r̃ = r + `Σ_i` Σ_{j≠i} [ α ι^{ji} `I_JSD(m^{ji`}; a^i) − β (1 − ι^{ji}) `I_CLUB(m^{ji`}; a^i) ]
 //!
-//! JSD (lower bound) learns from a ring of delivered pairs, CLUB (upper bound) from a ring of lost ones; both are
-//! shared over all ordered links. Values are per sample; negatives are cyclic shifts of the action at fixed message,
-//! so none is its own partner.
+//! JSD (lower bound) learns from delivered pairs, CLUB (upper bound) from lost ones; both are shared over all ordered
+//! links, or each link has its own. Values are per sample; negatives are cyclic shifts of the action at fixed message,
+//! so none is its own partner, or all actions of the minibatch.
 
 use super::TrainError;
-use super::config::{DumieConfig, LostMessage, Shaping};
-use super::replay::Ring;
+use super::config::{DumieConfig, Estimators, LostMessage, PairSource, Shaping};
+use super::estimator::{Class, Estimator, Nets, Pairs, Place};
+use super::replay::Replay;
 use crate::algo::Batch;
-use crate::mi::conditional::{ConditionalTape, GaussianConditional};
-use crate::mi::critic::{CriticTape, Separable};
-use crate::mi::losses;
-use crate::nn::{Adam, AdamConfig, Params};
 use crate::rng::{self, Seeds, Stream};
 use crate::schema::{Episode, Layout};
+
+/// Draws of a transition per pair wanted before a class counts as absent from replay.
+const TRIES: usize = 64;
 
 /// What the estimators report; `None` where there was nothing to estimate from.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct DumieMetrics {
-    /// JSD value of the training minibatch (shifted or not, as configured).
+    /// JSD value of the training minibatch (shifted or not, as configured); mean over estimators, as all four.
     pub jsd: Option<f64>,
     /// JSD value of pairs that the critic has not learned from yet.
     pub jsd_heldout: Option<f64>,
@@ -30,85 +30,22 @@ pub struct DumieMetrics {
     pub club_heldout: Option<f64>,
 }
 
-/// Pairs of one class.
-#[derive(Debug, Default)]
-struct Pairs {
-    messages: Vec<f32>,
-    actions: Vec<f32>,
-    /// Which transition of the batch each pair belongs to.
-    rows: Vec<usize>,
-}
-
-impl Pairs {
-    fn clear(&mut self) {
-        self.messages.clear();
-        self.actions.clear();
-        self.rows.clear();
-    }
-
-    fn push(&mut self, widths: [usize; 2], message: &[f32], action: &[f32], row: usize) {
-        self.messages.extend_from_slice(message);
-        self.messages.resize(self.messages.len() + widths[0] - message.len(), 0.0);
-        self.actions.extend_from_slice(action);
-        self.actions.resize(self.actions.len() + widths[1] - action.len(), 0.0);
-        self.rows.push(row);
-    }
-
-    fn len(&self) -> usize {
-        self.rows.len()
-    }
-}
-
-/// One estimator's parameters, optimiser and ring.
-#[derive(Debug)]
-pub struct Estimator {
-    /// Parameters, flat.
-    pub params: Params,
-    /// Optimiser.
-    pub adam: Adam,
-    /// The newest pairs of its class.
-    pub ring: Ring,
-    /// Pairs that came since the last update, at most a ring's worth: held out until then.
-    fresh: Pairs,
-}
-
-impl Estimator {
-    /// The pairs held out until the next update: messages and actions, flat.
-    pub(super) fn fresh(&self) -> [&[f32]; 2] {
-        [&self.fresh.messages, &self.fresh.actions]
-    }
-
-    /// Takes over held-out pairs of a checkpoint; false when their lengths do not fit.
-    pub(super) fn restore_fresh(&mut self, messages: Vec<f32>, actions: Vec<f32>) -> bool {
-        let [m, a] = self.ring.widths;
-        let pairs = messages.len() / m;
-        let fits = messages.len() == pairs * m && actions.len() == pairs * a;
-        self.fresh = Pairs { messages, actions, rows: vec![0; pairs] };
-        fits
-    }
-}
-
 /// The dual estimator.
 #[derive(Debug)]
 pub struct Dumie {
     config: DumieConfig,
     weights: [f64; 2],
     learners: Vec<usize>,
-    widths: [usize; 2],
-    observation: Vec<usize>,
-    action: Vec<usize>,
-    critic: Separable,
-    q: GaussianConditional,
-    /// JSD over delivered pairs.
-    pub jsd: Estimator,
-    /// CLUB over lost pairs.
-    pub club: Estimator,
-    critic_tape: CriticTape,
-    q_tape: ConditionalTape,
-    pairs: [Pairs; 2],
-    negatives: Vec<u32>,
-    values: Vec<f32>,
-    grads: [Vec<f32>; 3],
+    /// Where each learner's observation and action lie in a transition.
+    observation: Vec<Place>,
+    action: Vec<Place>,
+    nets: Nets,
+    /// JSD over delivered pairs: one, or one per ordered link.
+    pub jsd: Vec<Estimator>,
+    /// CLUB over lost pairs: one, or one per ordered link.
+    pub club: Vec<Estimator>,
+    /// A minibatch's pairs, by class and estimator.
+    pairs: [Vec<Pairs>; 2],
 }
 
 impl Dumie {
@@ -118,59 +55,70 @@ impl Dumie {
     /// [`TrainError::Nn`] when candle refuses the allocation.
     pub fn new(layout: &Layout, config: DumieConfig, weights: [f64; 2], seeds: &Seeds) -> Result<Self, TrainError> {
         let learners = layout.learners();
-        let observation: Vec<usize> = learners.iter().map(|&a| layout.agents[a].observation).collect();
-        let action: Vec<usize> = learners.iter().map(|&a| layout.agents[a].action).collect();
-        let widest = |v: &[usize]| v.iter().copied().max().unwrap_or(1).max(1);
-        let widths = [widest(&observation), widest(&action)];
-        let critic = Separable::paper(widths[0], widths[1]);
-        let q = GaussianConditional::paper(widths[0], widths[1]);
-        let estimator = |init: &dyn Fn(&mut Stream, &mut Vec<f32>), name: &str| -> Result<Estimator, TrainError> {
-            let mut params = Vec::new();
-            init(&mut seeds.stream(name), &mut params);
-            Ok(Estimator {
-                adam: Adam::new(AdamConfig::new(config.learning_rate), params.len()),
-                params: Params::new(params)?,
-                ring: Ring::new(config.ring, widths),
-                fresh: Pairs::default(),
-            })
+        let places = |width: fn(&crate::schema::AgentSpec) -> usize| -> Vec<Place> {
+            let mut at = 0;
+            let place = |&agent: &usize| {
+                let width = width(&layout.agents[agent]);
+                at += width;
+                [at - width, width]
+            };
+            learners.iter().map(place).collect()
         };
-        Ok(Self {
-            jsd: estimator(&|rng, out| critic.init(rng, out), "jsd")?,
-            club: estimator(&|rng, out| q.init(rng, out), "club")?,
-            config,
-            weights,
-            learners,
-            widths,
-            observation,
-            action,
-            critic,
-            q,
-            critic_tape: CriticTape::default(),
-            q_tape: ConditionalTape::default(),
-            pairs: Default::default(),
-            negatives: Vec::new(),
-            values: Vec::new(),
-            grads: Default::default(),
-        })
+        let (observation, action) = (places(|a| a.observation), places(|a| a.action));
+        let widest = |places: &[Place]| places.iter().map(|p| p[1]).max().unwrap_or(1).max(1);
+        let widths = [widest(&observation), widest(&action)];
+        let links = learners.len() * learners.len().saturating_sub(1);
+        let nets = Nets::new(widths, config.negatives, links);
+        let count = if config.estimators == Estimators::Shared { 1 } else { links };
+        let mut made = [Vec::new(), Vec::new()];
+        for (made, name) in made.iter_mut().zip(["jsd", "club"]) {
+            for link in 0..count {
+                let mut rng = if count == 1 { seeds.stream(name) } else { seeds.indexed_stream(name, link as u64) };
+                let mut params = Vec::new();
+                if name == "jsd" {
+                    nets.critic.init(&mut rng, &mut params);
+                } else {
+                    nets.q.init(&mut rng, &mut params);
+                }
+                made.push(Estimator::new(params, config.learning_rate, config.ring, widths)?);
+            }
+        }
+        let [jsd, club] = made;
+        let pairs = [(); 2].map(|()| (0..count).map(|_| Pairs::default()).collect());
+        Ok(Self { config, weights, learners, observation, action, nets, jsd, club, pairs })
+    }
+
+    /// Every estimator with its name: `jsd`, `club`, or with the link's number behind it (sender by receiver).
+    pub fn named(&self) -> impl Iterator<Item = (String, &Estimator)> {
+        let name = |class: &'static str, link: usize, of: usize| {
+            if of == 1 { class.to_owned() } else { format!("{class}.{link}") }
+        };
+        let jsd = self.jsd.iter().enumerate().map(move |(at, e)| (name("jsd", at, self.jsd.len()), e));
+        jsd.chain(self.club.iter().enumerate().map(move |(at, e)| (name("club", at, self.club.len()), e)))
+    }
+
+    /// All estimators in the order of [`Self::named`], to restore them.
+    pub fn all_mut(&mut self) -> impl Iterator<Item = &mut Estimator> {
+        self.jsd.iter_mut().chain(&mut self.club)
+    }
+
+    /// Number of the estimator for messages of learner `j` to learner `i`.
+    fn estimator(&self, j: usize, i: usize) -> usize {
+        if self.config.estimators == Estimators::Shared { 0 } else { link(self.learners.len(), j, i) }
     }
 
     /// Puts an episode's pairs into the rings.
     pub fn observe(&mut self, episode: &Episode) {
         let n = self.learners.len();
         for row in 0..episode.steps {
-            for (j, &sender) in self.learners.iter().enumerate() {
-                for (i, &receiver) in self.learners.iter().enumerate() {
-                    if i == j {
-                        continue;
-                    }
-                    let estimator = if episode.delivered(n, row, j, i) { &mut self.jsd } else { &mut self.club };
-                    let zero = self.config.lost_message == LostMessage::Zero && !episode.delivered(n, row, j, i);
-                    let message = if zero { &[][..] } else { episode.messages[sender].row(row) };
-                    let action = episode.actions[receiver].row(row);
-                    estimator.ring.push(message, action);
-                    if estimator.fresh.len() < self.config.ring {
-                        estimator.fresh.push(self.widths, message, action, row);
-                    }
+            for j in 0..n {
+                for i in (0..n).filter(|&i| i != j) {
+                    let (delivered, at) = (episode.delivered(n, row, j, i), self.estimator(j, i));
+                    let zero = self.config.lost_message == LostMessage::Zero && !delivered;
+                    let message = if zero { &[][..] } else { episode.messages[self.learners[j]].row(row) };
+                    let action = episode.actions[self.learners[i]].row(row);
+                    let estimators = if delivered { &mut self.jsd } else { &mut self.club };
+                    estimators[at].observe(message, action);
                 }
             }
         }
@@ -181,100 +129,85 @@ impl Dumie {
     ///
     /// # Errors
     /// [`TrainError::Nn`].
-    pub fn train(&mut self, rng: &mut Stream, heldout: Option<&mut Stream>) -> Result<DumieMetrics, TrainError> {
-        let mut metrics = DumieMetrics::default();
-        if let Some(rng) = heldout {
-            metrics.jsd_heldout = self.heldout(true, rng);
-            metrics.club_heldout = self.heldout(false, rng);
-        }
-        self.jsd.fresh.clear();
-        self.club.fresh.clear();
-        for _ in 0..self.config.k {
-            if self.jsd.ring.len() >= self.config.start {
-                metrics.jsd = Some(self.train_jsd(rng)?);
+    pub fn train(
+        &mut self,
+        replay: &Replay,
+        rng: &mut Stream,
+        mut heldout: Option<&mut Stream>,
+    ) -> Result<DumieMetrics, TrainError> {
+        let mut means = [[0.0; 2]; 4];
+        let mut count = |at: usize, value: f64| means[at] = [means[at][0] + value, means[at][1] + 1.0];
+        if let Some(rng) = heldout.as_deref_mut() {
+            for (at, class, estimators) in [(1, Class::Delivered, &self.jsd), (3, Class::Lost, &self.club)] {
+                for estimator in estimators {
+                    self.nets.heldout(class, estimator, rng).into_iter().for_each(|value| count(at, value));
+                }
             }
-            if self.club.ring.len() >= self.config.start {
-                metrics.club = Some(self.train_club(rng)?);
+        }
+        self.all_mut().for_each(Estimator::forget_fresh);
+        for step in 0..self.config.k {
+            for (at, class) in [(0, Class::Delivered), (2, Class::Lost)] {
+                for index in 0..self.jsd.len() {
+                    let value = self.learn(class, index, replay, rng)?;
+                    // what is reported is the last step's
+                    value.into_iter().filter(|_| step + 1 == self.config.k).for_each(|value| count(at, value));
+                }
             }
         }
-        Ok(metrics)
+        let [jsd, jsd_heldout, club, club_heldout] = means.map(|[sum, count]| (count > 0.0).then(|| sum / count));
+        let shift = |value: Option<f64>| value.map(|v| self.displayed(v));
+        Ok(DumieMetrics { jsd: shift(jsd), jsd_heldout: shift(jsd_heldout), club, club_heldout })
     }
 
-    fn train_jsd(&mut self, rng: &mut Stream) -> Result<f64, TrainError> {
-        let n = self.config.batch;
-        let [batch, _] = &mut self.pairs;
-        self.jsd.ring.sample(rng, n, &mut batch.messages, &mut batch.actions);
-        shifts(rng, n, self.config.negatives, &mut self.negatives);
-        let params = self.jsd.params.read();
-        let tape = &mut self.critic_tape;
-        self.critic.scores(&params, &batch.messages, &batch.actions, n, &self.negatives, tape);
-        self.values.resize(n, 0.0);
-        let [positive, negative, grads] = &mut self.grads;
-        positive.resize(n, 0.0);
-        negative.resize(self.negatives.len(), 0.0);
-        let loss = losses::jsd(&tape.positive, &tape.negative, &mut self.values, positive, negative);
-        grads.clear();
-        grads.resize(params.len(), 0.0);
-        self.critic.backward(&params, &batch.messages, &batch.actions, tape, positive, negative, grads);
-        drop(params);
-        let adam = &mut self.jsd.adam;
-        self.jsd.params.update(|p| adam.step(p, grads))?;
-        Ok(self.displayed(-loss))
-    }
-
-    fn train_club(&mut self, rng: &mut Stream) -> Result<f64, TrainError> {
-        let n = self.config.batch;
-        let [_, batch] = &mut self.pairs;
-        self.club.ring.sample(rng, n, &mut batch.messages, &mut batch.actions);
-        shifts(rng, n, self.config.negatives, &mut self.negatives);
-        let params = self.club.params.read();
-        let tape = &mut self.q_tape;
-        self.q.forward(&params, &batch.messages, n, tape);
-        self.values.resize(n, 0.0);
-        let value = losses::club_values(tape.mu(), tape.logvar(), &batch.actions, &self.negatives, &mut self.values);
-        let [grad_mu, grad_logvar, grads] = &mut self.grads;
-        grad_mu.resize(n * self.widths[1], 0.0);
-        grad_logvar.resize(n * self.widths[1], 0.0);
-        losses::nll(tape.mu(), tape.logvar(), &batch.actions, n, grad_mu, grad_logvar);
-        grads.clear();
-        grads.resize(params.len(), 0.0);
-        self.q.backward(&params, &batch.messages, tape, grad_mu, grad_logvar, grads);
-        drop(params);
-        let adam = &mut self.club.adam;
-        self.club.params.update(|p| adam.step(p, grads))?;
+    /// One step of one estimator, when it has pairs enough.
+    fn learn(&mut self, class: Class, index: usize, replay: &Replay, rng: &mut Stream) -> Result<Option<f64>, TrainError> {
+        let estimators = if class == Class::Delivered { &mut self.jsd } else { &mut self.club };
+        let estimator = &mut estimators[index];
+        if estimator.ring.len() < self.config.start {
+            return Ok(None);
+        }
+        if self.config.pairs == PairSource::Rings {
+            return self.nets.learn(class, estimator, self.config.batch, rng).map(Some);
+        }
+        let mut pairs = std::mem::take(&mut self.pairs[0][index]);
+        let found = self.filter(class, index, replay, rng, &mut pairs);
+        let estimators = if class == Class::Delivered { &mut self.jsd } else { &mut self.club };
+        let Estimator { params, adam, .. } = &mut estimators[index];
+        let data = [&replay.observations[..], &replay.actions];
+        let value =
+            if found { Some(self.nets.step(class, params, adam, &pairs, data, rng)?) } else { None };
+        self.pairs[0][index] = pairs;
         Ok(value)
     }
 
-    /// Mean value of one class on the pairs that its estimator has not seen, once it has learned at all.
-    fn heldout(&mut self, delivered: bool, rng: &mut Stream) -> Option<f64> {
-        let estimator = if delivered { &mut self.jsd } else { &mut self.club };
-        let pairs = std::mem::take(&mut estimator.fresh);
-        let value = (estimator.adam.t > 0 && pairs.len() > 1).then(|| {
-            let mean = self.values_of(&pairs, delivered, rng);
-            if delivered { self.displayed(mean) } else { mean }
-        });
-        if delivered {
-            self.jsd.fresh = pairs;
-        } else {
-            self.club.fresh = pairs;
+    /// Draws pairs of one class from all of replay; false when it hardly has any.
+    fn filter(&self, class: Class, index: usize, replay: &Replay, rng: &mut Stream, pairs: &mut Pairs) -> bool {
+        let n = self.learners.len();
+        pairs.clear();
+        pairs.reserve(self.config.batch);
+        for _ in 0..TRIES * self.config.batch {
+            let transition = rng::below(rng, replay.len());
+            let of = if self.jsd.len() == 1 { rng::below(rng, n * (n - 1)) } else { index };
+            let (j, i) = (of / (n - 1), of % (n - 1));
+            let i = i + usize::from(i >= j);
+            let [observation, action, bits] = replay.places(transition);
+            let delivered = replay.link[bits + j * n + i];
+            if delivered == (class == Class::Delivered) {
+                let [message, to] = self.pair(delivered, j, i);
+                pairs.push([observation + message[0], message[1]], [action + to[0], to[1]], 0);
+                if pairs.len() == self.config.batch {
+                    return true;
+                }
+            }
         }
-        value
+        false
     }
 
-    /// Per-sample values of one class into `self.values`; JSD shifted, CLUB in nats. Returns the mean.
-    fn values_of(&mut self, pairs: &Pairs, delivered: bool, rng: &mut Stream) -> f64 {
-        let n = pairs.len();
-        shifts(rng, n, self.config.negatives, &mut self.negatives);
-        self.values.resize(n, 0.0);
-        if delivered {
-            let (params, tape) = (self.jsd.params.read(), &mut self.critic_tape);
-            self.critic.scores(&params, &pairs.messages, &pairs.actions, n, &self.negatives, tape);
-            losses::jsd_values(&tape.positive, &tape.negative, &mut self.values)
-        } else {
-            let (params, tape) = (self.club.params.read(), &mut self.q_tape);
-            self.q.forward(&params, &pairs.messages, n, tape);
-            losses::club_values(tape.mu(), tape.logvar(), &pairs.actions, &self.negatives, &mut self.values)
-        }
+    /// Where message j → i and action i lie in a transition.
+    fn pair(&self, delivered: bool, j: usize, i: usize) -> [Place; 2] {
+        let [start, width] = self.observation[j];
+        let zero = !delivered && self.config.lost_message == LostMessage::Zero;
+        [[start, if zero { 0 } else { width }], self.action[i]]
     }
 
     /// A JSD value on the configured scale: shifted, or as the paper prints it.
@@ -284,43 +217,40 @@ impl Dumie {
 
     /// The shaping bonus of each transition of a minibatch, `[B]`.
     pub fn bonus(&mut self, batch: &Batch, rng: &mut Stream, bonus: &mut Vec<f32>) {
-        let (n, o, a) =
-            (self.learners.len(), self.observation.iter().sum::<usize>(), self.action.iter().sum::<usize>());
+        let n = self.learners.len();
+        let width = |places: &[Place]| places.iter().map(|p| p[1]).sum::<usize>();
+        let (o, a) = (width(&self.observation), width(&self.action));
         let mut classes = std::mem::take(&mut self.pairs);
-        classes.iter_mut().for_each(Pairs::clear);
-        for row in 0..batch.rows {
-            let (observations, actions) = (&batch.observations[row * o..], &batch.actions[row * a..]);
-            let mut message_at = 0;
+        for pairs in classes.iter_mut().flatten() {
+            pairs.clear();
+            pairs.reserve(batch.rows * n * (n - 1) / self.jsd.len());
+        }
+        for (row, bits) in batch.link.chunks_exact(n * n).enumerate() {
             for j in 0..n {
-                let message = &observations[message_at..message_at + self.observation[j]];
-                let mut action_at = 0;
-                for i in 0..n {
-                    if i != j {
-                        let delivered = batch.link[(row * n + j) * n + i];
-                        let zero = !delivered && self.config.lost_message == LostMessage::Zero;
-                        let message = if zero { &[][..] } else { message };
-                        let action = &actions[action_at..action_at + self.action[i]];
-                        classes[usize::from(!delivered)].push(self.widths, message, action, row);
-                    }
-                    action_at += self.action[i];
+                for i in (0..n).filter(|&i| i != j) {
+                    let delivered = bits[j * n + i];
+                    let [message, action] = self.pair(delivered, j, i);
+                    let pairs = &mut classes[usize::from(!delivered)][self.estimator(j, i)];
+                    pairs.push([row * o + message[0], message[1]], [row * a + action[0], action[1]], row);
                 }
-                message_at += self.observation[j];
             }
         }
         bonus.clear();
         bonus.resize(batch.rows, 0.0);
-        for (class, pairs) in classes.iter().enumerate() {
-            let delivered = class == 0;
-            let weight = if delivered { self.weights[0] } else { -self.weights[1] } as f32;
-            let estimator = if delivered { &self.jsd } else { &self.club };
-            let learned = estimator.ring.len() >= self.config.start && estimator.adam.t > 0;
-            if weight == 0.0 || !learned || pairs.len() < 2 {
-                continue;
-            }
-            self.values_of(pairs, delivered, rng);
+        for (class, all) in [Class::Delivered, Class::Lost].into_iter().zip(&classes) {
+            let delivered = class == Class::Delivered;
+            let (weight, estimators) =
+                if delivered { (self.weights[0], &self.jsd) } else { (-self.weights[1], &self.club) };
             let shift = if delivered && !self.config.jsd_shift { 2.0 * core::f32::consts::LN_2 } else { 0.0 };
-            for (&row, value) in pairs.rows.iter().zip(&self.values) {
-                bonus[row] += weight * (value - shift);
+            for (pairs, estimator) in all.iter().zip(estimators) {
+                let learned = estimator.ring.len() >= self.config.start && estimator.adam.t > 0;
+                if weight == 0.0 || !learned || pairs.len() < 2 {
+                    continue;
+                }
+                self.nets.evaluate(class, estimator, pairs, [&batch.observations, &batch.actions], rng);
+                for (&row, value) in pairs.rows.iter().zip(&self.nets.values) {
+                    bonus[row as usize] += weight as f32 * (value - shift);
+                }
             }
         }
         self.pairs = classes;
@@ -345,17 +275,16 @@ impl Dumie {
     }
 }
 
-/// `k` random cyclic shifts of `0..n`, as `[n, k]` indices: derangements without a draw per element.
-fn shifts(rng: &mut Stream, n: usize, k: usize, out: &mut Vec<u32>) {
-    let offsets: Vec<usize> = (0..k).map(|_| 1 + rng::below(rng, n - 1)).collect();
-    out.clear();
-    out.extend((0..n).flat_map(|i| offsets.iter().map(move |&o| ((i + o) % n) as u32)));
+/// Number of the ordered link j → i of `n` learners.
+fn link(n: usize, j: usize, i: usize) -> usize {
+    j * (n - 1) + i - usize::from(i > j)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::schema::{AgentSpec, Controller, Matrix};
+    use crate::train::config::Negatives;
 
     fn layout() -> Layout {
         let agent = |name: &str| AgentSpec {
@@ -390,25 +319,86 @@ mod tests {
         e
     }
 
-    fn trained(weights: [f64; 2]) -> Dumie {
-        let config = DumieConfig { learning_rate: 1e-2, batch: 256, ..DumieConfig::default() };
-        let mut dumie = Dumie::new(&layout(), config, weights, &Seeds::new(1)).unwrap();
+    fn config() -> DumieConfig {
+        DumieConfig { learning_rate: 1e-2, batch: 256, ..DumieConfig::default() }
+    }
+
+    fn replay(episodes: u64) -> Replay {
+        let mut replay = Replay::new(&layout(), 25, 10_000).unwrap();
+        (0..episodes).for_each(|index| replay.push(&episode(index), &[]).unwrap());
+        replay
+    }
+
+    fn trained_as(config: DumieConfig, weights: [f64; 2]) -> (Dumie, Replay) {
+        let (mut dumie, replay) = (Dumie::new(&layout(), config, weights, &Seeds::new(1)).unwrap(), replay(60));
         for index in 0..60 {
             dumie.observe(&episode(index));
         }
         for index in 0..300 {
-            dumie.train(&mut Seeds::new(2).indexed_stream("t", index), None).unwrap();
+            dumie.train(&replay, &mut Seeds::new(2).indexed_stream("t", index), None).unwrap();
         }
         dumie.observe(&episode(1000));
-        dumie
+        (dumie, replay)
+    }
+
+    fn trained(weights: [f64; 2]) -> Dumie {
+        trained_as(config(), weights).0
     }
 
     #[test]
-    fn jsd_finds_what_delivered_messages_tell_and_club_that_lost_ones_tell_nothing() {
-        let mut dumie = trained([0.01, 0.01]);
-        let metrics = dumie.train(&mut Seeds::new(2).stream("last"), Some(&mut Seeds::new(2).stream("held"))).unwrap();
-        assert!(metrics.jsd_heldout.unwrap() > 0.1, "{metrics:?}");
-        assert!(metrics.club_heldout.unwrap().abs() < 0.1, "{metrics:?}");
+    fn jsd_finds_what_delivered_messages_tell_and_club_that_lost_ones_tell_nothing_in_every_variant() {
+        let variants = [
+            config(),
+            DumieConfig { negatives: Negatives::All, ..config() },
+            DumieConfig { pairs: PairSource::Replay, ..config() },
+            DumieConfig { estimators: Estimators::PerLink, ..config() },
+            DumieConfig { estimators: Estimators::PerLink, pairs: PairSource::Replay, k: 2, ..config() },
+        ];
+        for config in variants {
+            let estimators = if config.estimators == Estimators::Shared { 2 } else { 4 };
+            let (mut dumie, replay) = trained_as(config, [0.01, 0.01]);
+            assert_eq!(dumie.named().count(), estimators);
+            let mut heldout = Seeds::new(2).stream("held");
+            let metrics = dumie.train(&replay, &mut Seeds::new(2).stream("last"), Some(&mut heldout)).unwrap();
+            for jsd in [metrics.jsd, metrics.jsd_heldout] {
+                assert!(jsd.unwrap() > 0.1, "{metrics:?} {:?}", dumie.config);
+            }
+            for club in [metrics.club, metrics.club_heldout] {
+                assert!(club.unwrap().abs() < 0.1, "{metrics:?} {:?}", dumie.config);
+            }
+        }
+    }
+
+    #[test]
+    fn the_estimators_of_a_link_see_its_pairs_alone() {
+        let config = DumieConfig { estimators: Estimators::PerLink, ring: 1000, ..config() };
+        let mut dumie = Dumie::new(&layout(), config, [1.0, 1.0], &Seeds::new(1)).unwrap();
+        let names: Vec<String> = dumie.named().map(|(name, _)| name).collect();
+        assert_eq!(names, ["jsd.0", "jsd.1", "club.0", "club.1"]);
+        let e = episode(0);
+        dumie.observe(&e);
+        // even steps deliver a → b, odd ones b → a
+        let [first, second] = [0, 1].map(|link| &dumie.jsd[link].ring);
+        assert_eq!((first.len(), second.len()), (13, 12));
+        assert_eq!(first.messages, e.messages[0].data[..25].iter().step_by(2).copied().collect::<Vec<_>>());
+        assert_eq!(second.actions, e.actions[0].data[1..25].iter().step_by(2).copied().collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn pairs_from_replay_are_those_of_the_class_and_a_class_that_is_absent_teaches_nothing() {
+        let (mut dumie, replay) = trained_as(DumieConfig { pairs: PairSource::Replay, ..config() }, [1.0, 1.0]);
+        let (mut pairs, mut rng) = (Pairs::default(), Seeds::new(3).stream("f"));
+        assert!(dumie.filter(Class::Delivered, 0, &replay, &mut rng, &mut pairs));
+        assert_eq!(pairs.len(), 256);
+        let [x, y] = pairs.of([&replay.observations, &replay.actions]);
+        // on delivered links the receiver does what it heard
+        assert!(x.starts.iter().zip(y.starts).all(|(x_at, y_at)| x.data[*x_at as usize] == y.data[*y_at as usize]));
+        let mut lossless = replay.clone();
+        lossless.link.fill(true);
+        let before = dumie.club[0].params.read().to_vec();
+        let metrics = dumie.train(&lossless, &mut rng, None).unwrap();
+        assert!(metrics.jsd.is_some() && metrics.club.is_none(), "{metrics:?}");
+        assert_eq!(before, *dumie.club[0].params.read());
     }
 
     #[test]

@@ -3,6 +3,7 @@
 mod checkpoint;
 pub mod config;
 pub mod dumie;
+mod estimator;
 mod evaluate;
 mod metrics;
 pub mod replay;
@@ -12,6 +13,7 @@ mod tensorboard;
 use std::path::PathBuf;
 
 pub use config::TrainConfig;
+pub use estimator::Estimator;
 pub use evaluate::{EVALUATION_COLUMNS, EvaluationRow, evaluate, write_evaluation};
 pub use metrics::{METRIC_COLUMNS, MetricsRow};
 pub use run::{Options, Progress, Report, Trainer, train};

@@ -232,6 +232,25 @@ impl Replay {
         Ok(())
     }
 
+    /// Where a transition's observations, actions and link bits start in their arrays.
+    pub(super) fn places(&self, transition: usize) -> [usize; 3] {
+        let [o, a, l] = self.widths;
+        let row = transition + transition / self.steps;
+        [row * o, transition * a, row * l]
+    }
+
+    /// Gives each row of `batch` the link bits of another transition, for o and o' alike ([`Masks::Redrawn`]).
+    ///
+    /// [`Masks::Redrawn`]: crate::algo::Masks::Redrawn
+    pub fn redraw_links<R: Rng + ?Sized>(&self, rng: &mut R, batch: &mut Batch) {
+        let l = self.widths[2];
+        for (now, next) in batch.link.chunks_exact_mut(l).zip(batch.next_link.chunks_exact_mut(l)) {
+            let [_, _, at] = self.places(rng::below(rng, self.len()));
+            now.copy_from_slice(&self.link[at..at + l]);
+            next.copy_from_slice(&self.link[at..at + l]);
+        }
+    }
+
     /// Draws `rows` transitions with replacement into `batch`.
     pub fn sample<R: Rng + ?Sized>(&self, rng: &mut R, rows: usize, batch: &mut Batch) {
         let [o, a, l] = self.widths;
@@ -323,16 +342,11 @@ impl Ring {
         self.pushed += 1;
     }
 
-    /// Draws `rows` pairs with replacement.
-    pub fn sample<R: Rng + ?Sized>(&self, rng: &mut R, rows: usize, messages: &mut Vec<f32>, actions: &mut Vec<f32>) {
-        let [m, a] = self.widths;
-        messages.clear();
-        actions.clear();
-        for _ in 0..rows {
-            let i = rng::below(rng, self.len());
-            messages.extend_from_slice(&self.messages[i * m..(i + 1) * m]);
-            actions.extend_from_slice(&self.actions[i * a..(i + 1) * a]);
-        }
+    /// Forgets everything.
+    pub(super) fn clear(&mut self) {
+        self.pushed = 0;
+        self.messages.clear();
+        self.actions.clear();
     }
 }
 
@@ -393,6 +407,24 @@ mod tests {
             assert_eq!(batch.actions[i * 2..i * 2 + 2], [here, here + 2.0]);
             assert_eq!(batch.link[i * 4 + 1], t % 2 == 0);
             assert_eq!(batch.next_link[i * 4 + 2], (t + 1) % 3 == 0);
+        }
+    }
+
+    #[test]
+    fn redrawn_links_are_those_of_some_transition_for_both_observations() {
+        let mut replay = Replay::new(&layout(), 4, 12).unwrap();
+        (0..3).for_each(|index| replay.push(&episode(index, 4), &[]).unwrap());
+        let (mut batch, mut rng) = (Batch::default(), Seeds::new(1).stream("s"));
+        replay.sample(&mut rng, 500, &mut batch);
+        let kept = batch.clone();
+        replay.redraw_links(&mut rng, &mut batch);
+        assert_eq!(batch.link, batch.next_link);
+        assert_ne!(batch.link, kept.link);
+        assert_eq!(batch.observations, kept.observations);
+        // of the steps 0..4, two deliver a → b and two (0 and 3) b → a
+        for (at, steps) in [(1, 2.0), (2, 2.0)] {
+            let delivered = batch.link.iter().skip(at).step_by(4).filter(|&&bit| bit).count() as f64;
+            assert!((delivered / 500.0 - steps / 4.0).abs() < 0.1, "{at}: {delivered}");
         }
     }
 

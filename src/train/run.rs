@@ -8,7 +8,7 @@ use super::dumie::Dumie;
 use super::metrics::{self, Means, MetricsRow};
 use super::replay::{Replay, Ring};
 use super::{TrainError, checkpoint};
-use crate::algo::{Batch, Maddpg, MaddpgConfig};
+use crate::algo::{Batch, Maddpg, MaddpgConfig, Masks};
 use crate::link::Link;
 use crate::nn::Activation;
 use crate::record::{ActionNoise, Recording, Trained, build_link, check_link, loss_rate};
@@ -220,6 +220,9 @@ impl Trainer {
         let mut rng = self.seeds.indexed_stream("update", update);
         let rows = self.config.maddpg.batch.unwrap_or(MaddpgConfig::BATCH);
         self.replay.sample(&mut rng, rows, &mut self.batch);
+        if self.config.maddpg.masks == Masks::Redrawn {
+            self.replay.redraw_links(&mut rng, &mut self.batch);
+        }
         rng
     }
 
@@ -239,7 +242,7 @@ impl Trainer {
         self.bonus.clear();
         if let Some(dumie) = &mut self.dumie {
             let mut heldout = report.then(|| self.seeds.indexed_stream("heldout", self.update));
-            let found = dumie.train(&mut rng, heldout.as_mut())?;
+            let found = dumie.train(&self.replay, &mut rng, heldout.as_mut())?;
             for (name, value) in [
                 ("jsd", found.jsd),
                 ("jsd_heldout", found.jsd_heldout),
@@ -324,9 +327,9 @@ impl Trainer {
         checkpoint::load(self)
     }
 
-    /// The rings of delivered and of lost messages, where the run has estimators.
-    pub fn rings(&self) -> Option<[&Ring; 2]> {
-        self.dumie.as_ref().map(|d| [&d.jsd.ring, &d.club.ring])
+    /// The rings of the estimators, those of delivered messages first, where the run has any.
+    pub fn rings(&self) -> Option<Vec<&Ring>> {
+        self.dumie.as_ref().map(|dumie| dumie.jsd.iter().chain(&dumie.club).map(|e| &e.ring).collect())
     }
 
     fn return_mean(&self) -> Option<f64> {

@@ -12,6 +12,7 @@ mod forged;
 mod fuzz;
 mod integrity;
 mod link_commands;
+mod learner;
 mod links;
 mod mi;
 mod record;

@@ -64,6 +64,43 @@ fn an_interrupted_run_that_is_resumed_ends_with_the_bytes_of_an_uninterrupted_on
 }
 
 #[test]
+fn every_option_of_learner_and_estimators_trains_differently_and_resumes_to_the_same_bytes() {
+    use ccmarl::algo::{ActorStep, Masks, Messages};
+    use ccmarl::train::config::{Estimators, LostMessage, Negatives, PairSource, Shaping};
+    let options: [(&str, fn(&mut TrainConfig)); 11] = [
+        ("defaults", |_| ()),
+        ("messages off", |c| c.maddpg.messages = Messages::Off),
+        ("actor step per agent", |c| c.maddpg.actor_step = ActorStep::PerAgent),
+        ("masks redrawn", |c| c.maddpg.masks = Masks::Redrawn),
+        ("all negatives", |c| c.dumie.negatives = Negatives::All),
+        ("an estimator per link", |c| (c.dumie.estimators, c.dumie.start) = (Estimators::PerLink, 60)),
+        ("pairs from replay", |c| c.dumie.pairs = PairSource::Replay),
+        ("lost messages as zeros", |c| c.dumie.lost_message = LostMessage::Zero),
+        ("shaping at rollout", |c| c.dumie.shaping = Shaping::AtRollout),
+        ("unshifted", |c| c.dumie.jsd_shift = false),
+        ("two estimator steps", |c| c.dumie.k = 2),
+    ];
+    let dir = tempfile::tempdir().unwrap();
+    let mut seen = Vec::new();
+    for (name, set) in options {
+        let mut wanted = config("cc-maddpg", 3000);
+        set(&mut wanted);
+        let [whole, parts] = ["whole", "parts"].map(|part| dir.path().join(name).join(part));
+        run(wanted.clone(), &whole, &Options::default());
+        let stop = AtomicBool::new(false);
+        let mut progress = |p: ccmarl::train::Progress| stop.store(p.step >= 2000, Ordering::Relaxed);
+        train(wanted.clone(), &parts, &Options::default(), &mut progress, &stop).unwrap();
+        run(wanted, &parts, &Options { resume: true, ..Options::default() });
+        for file in LEARNED.into_iter().chain(["checkpoint/state.safetensors", "config.toml"]) {
+            assert!(bytes(&whole, file) == bytes(&parts, file), "{name}: {file} differs after a stop");
+        }
+        let actors = bytes(&whole, LEARNED[0]);
+        assert!(!seen.contains(&actors), "{name} changed nothing");
+        seen.push(actors);
+    }
+}
+
+#[test]
 fn a_resumed_run_refuses_a_changed_configuration_and_names_the_difference() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("run");
@@ -116,8 +153,9 @@ fn a_warm_start_fills_the_rings_as_the_rollouts_did() {
         rolled.advance(None).unwrap();
     }
     warm.warm_start(ccmarl::storage::open(&store).unwrap().as_mut()).unwrap();
-    let [delivered, lost] = warm.rings().unwrap();
+    let rings = warm.rings().unwrap();
     assert_eq!(warm.rings(), rolled.rings());
+    let (delivered, lost) = (rings[0], rings[1]);
     assert!(delivered.len() == 1000 && lost.len() > 500, "{} and {}", delivered.len(), lost.len());
 }
 
@@ -199,6 +237,13 @@ fn configurations_are_refused_with_their_line_or_their_name() {
     assert!(typo.contains("line 4") && typo.contains("unknown field `gama`"), "{typo}");
     let range = read(&format!("{start}[maddpg]\ngamma = 1.5\n")).unwrap_err();
     assert_eq!(range, "maddpg.gamma: expected a value in [0, 1], found 1.5");
+    let negatives = |value: &str| read(&format!("{start}[dumie]\nnegatives = {value}\n"));
+    assert_eq!((negatives("\"all\""), negatives("3")), (Ok(()), Ok(())));
+    assert_eq!(negatives("0").unwrap_err(), "dumie.negatives: expected at least 1, found 0");
+    let word = negatives("\"al\"").unwrap_err();
+    assert!(word.contains("line 4") && word.contains("expected a number or \"all\", found \"al\""), "{word}");
+    let step = read(&format!("{start}[maddpg]\nactor_step = \"jont\"\n")).unwrap_err();
+    assert!(step.contains("expected `joint` or `per-agent`"), "{step}");
     let name = read("algorithm = \"madpg\"\nscenario = { name = \"simple_spread\" }\n").unwrap_err();
     assert!(name.contains("unknown algorithm \"madpg\": did you mean maddpg"), "{name}");
     let sees_all = "algorithm = \"maddpg\"\nscenario = { name = \"simple_spread\", view_radius = \"none\" }\n";
