@@ -30,7 +30,7 @@ pub enum Activation {
 }
 
 impl Activation {
-    fn apply(self, z: f32) -> f32 {
+    pub(super) fn apply(self, z: f32) -> f32 {
         match self {
             Self::Identity => z,
             Self::Relu => z.max(0.0),
@@ -125,7 +125,8 @@ impl Mlp {
         self.widths.windows(2).map(|w| w[1] * (w[0] + 1)).sum()
     }
 
-    fn activation(&self, layer: usize) -> Activation {
+    /// What layer `layer` does to its sums.
+    pub(super) fn activation(&self, layer: usize) -> Activation {
         if layer + 1 == self.layers() { self.output } else { self.hidden }
     }
 

@@ -7,10 +7,12 @@ mod adam;
 mod mlp;
 mod params;
 mod product;
+mod rows;
 
 pub use adam::{Adam, AdamConfig, clip_norm, soft_update};
 pub use mlp::{Activation, Mlp, Tape};
 pub use params::{Params, ParamsRef, from_tensors, to_tensors};
+pub use rows::{Rows, RowsScratch};
 
 /// What can go wrong with networks and their files.
 #[derive(Debug, thiserror::Error)]

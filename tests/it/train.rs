@@ -112,7 +112,7 @@ fn a_warm_start_fills_the_rings_as_the_rollouts_did() {
     run(config("cc-maddpg", 900), &dir.path().join("a"), &Options { record: Some(&store), ..Options::default() });
     let resolved = config("cc-maddpg", 900).resolve().unwrap();
     let [mut rolled, mut warm] = [(); 2].map(|()| Trainer::new(resolved.clone(), dir.path()).unwrap());
-    for _ in 0..36 {
+    while rolled.step() < 900 {
         rolled.advance(None).unwrap();
     }
     warm.warm_start(ccmarl::storage::open(&store).unwrap().as_mut()).unwrap();
