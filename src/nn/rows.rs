@@ -55,10 +55,10 @@ impl Instructions {
     fn found() -> Self {
         #[cfg(target_arch = "x86_64")]
         {
-            if is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("fma") {
+            if is_x86_feature_detected!("avx512f") {
                 return Self::Avx512;
             }
-            if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+            if is_x86_feature_detected!("avx") && is_x86_feature_detected!("fma") {
                 return Self::Fma;
             }
         }
@@ -138,79 +138,101 @@ impl Layer {
     /// `[rows, stride]` sums before the activation.
     fn sums(&self, instructions: Instructions, input: &[f32], rows: usize, out: &mut [f32]) {
         match instructions {
-            // SAFETY: `Instructions::found` saw that the processor has what each function is compiled for
+            // SAFETY: `Instructions::found` saw that the processor has what the function is compiled for
             #[cfg(target_arch = "x86_64")]
-            Instructions::Avx512 => unsafe { self.sums_avx512(input, rows, out) },
+            Instructions::Avx512 => unsafe { avx512::sums(self, input, rows, out) },
+            // SAFETY: as above
             #[cfg(target_arch = "x86_64")]
-            Instructions::Fma => unsafe { self.sums_fma(input, rows, out) },
-            Instructions::Any => self.sums_by::<4, 1, false>(input, rows, out),
+            Instructions::Fma => unsafe { fma::sums(self, input, rows, out) },
+            Instructions::Any => self.plain_sums(input, rows, out),
         }
     }
 
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx512f,fma")]
-    fn sums_avx512(&self, input: &[f32], rows: usize, out: &mut [f32]) {
-        // 4 rows by 4 groups: 16 of 32 registers hold sums, and a weight is loaded once for 4 rows
-        self.sums_by::<4, 4, true>(input, rows, out);
-    }
-
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2,fma")]
-    fn sums_fma(&self, input: &[f32], rows: usize, out: &mut [f32]) {
-        // 4 rows by 1 group of two registers: 8 of 16 hold sums
-        self.sums_by::<4, 1, true>(input, rows, out);
-    }
-
-    /// Tiles of `R` rows by `C` groups of columns, then what is left, one row or one group at a time.
-    #[inline(always)]
-    fn sums_by<const R: usize, const C: usize, const FUSED: bool>(&self, input: &[f32], rows: usize, out: &mut [f32]) {
-        let groups = self.stride / LANES;
-        let mut row = 0;
-        while row < rows {
-            let tall = row + R <= rows;
-            let (x, y) = (&input[row * self.inputs..], &mut out[row * self.stride..]);
-            let mut group = 0;
-            while group < groups {
-                let wide = group + C <= groups;
-                match (tall, wide) {
-                    (true, true) => self.tile::<R, C, FUSED>(x, group * LANES, y),
-                    (true, false) => self.tile::<R, 1, FUSED>(x, group * LANES, y),
-                    (false, true) => self.tile::<1, C, FUSED>(x, group * LANES, y),
-                    (false, false) => self.tile::<1, 1, FUSED>(x, group * LANES, y),
-                }
-                group += if wide { C } else { 1 };
-            }
-            row += if tall { R } else { 1 };
-        }
-    }
-
-    #[inline(always)]
-    fn tile<const R: usize, const C: usize, const FUSED: bool>(&self, input: &[f32], column: usize, out: &mut [f32]) {
-        let input: [&[f32]; R] = std::array::from_fn(|r| &input[r * self.inputs..(r + 1) * self.inputs]);
-        let groups = |row: &[f32]| -> [[f32; LANES]; C] {
-            std::array::from_fn(|c| std::array::from_fn(|l| row[column + c * LANES + l]))
-        };
-        let mut sums = [groups(&self.bias); R];
-        for (i, row) in self.weight.chunks_exact(self.stride).enumerate() {
-            let weight = groups(row);
-            for r in 0..R {
-                let x = input[r][i];
-                for c in 0..C {
-                    for l in 0..LANES {
-                        let sum = &mut sums[r][c][l];
-                        *sum = if FUSED { x.mul_add(weight[c][l], *sum) } else { *sum + x * weight[c][l] };
-                    }
-                }
-            }
-        }
-        for r in 0..R {
-            for c in 0..C {
-                let at = r * self.stride + column + c * LANES;
-                out[at..at + LANES].copy_from_slice(&sums[r][c]);
+    fn plain_sums(&self, input: &[f32], rows: usize, out: &mut [f32]) {
+        let rows = input.chunks_exact(self.inputs).zip(out.chunks_exact_mut(self.stride)).take(rows);
+        for (input, sums) in rows {
+            sums.copy_from_slice(&self.bias);
+            for (x, weight) in input.iter().zip(self.weight.chunks_exact(self.stride)) {
+                sums.iter_mut().zip(weight).for_each(|(sum, w)| *sum += x * w);
             }
         }
     }
 }
+
+/// The sums in tiles of `$rows` rows by `$wide` registers, which all stay in registers; then what is left, one row or
+/// one register at a time.
+#[cfg(target_arch = "x86_64")]
+macro_rules! tiled {
+    ($module:ident, $features:literal, $lanes:literal, $rows:literal, $wide:literal, $load:ident, $splat:ident, $fused:ident, $store:ident) => {
+        mod $module {
+            use std::arch::x86_64::{$fused, $load, $splat, $store};
+
+            use super::Layer;
+
+            #[target_feature(enable = $features)]
+            pub(super) fn sums(layer: &Layer, input: &[f32], rows: usize, out: &mut [f32]) {
+                const WIDE: usize = $wide * $lanes;
+                let mut row = 0;
+                while row < rows {
+                    let tall = row + $rows <= rows;
+                    let (x, y) = (&input[row * layer.inputs..], &mut out[row * layer.stride..]);
+                    let mut column = 0;
+                    while column < layer.stride {
+                        let wide = column + WIDE <= layer.stride;
+                        match (tall, wide) {
+                            (true, true) => tile::<$rows, $wide>(layer, x, column, y),
+                            (true, false) => tile::<$rows, 1>(layer, x, column, y),
+                            (false, true) => tile::<1, $wide>(layer, x, column, y),
+                            (false, false) => tile::<1, 1>(layer, x, column, y),
+                        }
+                        column += if wide { WIDE } else { $lanes };
+                    }
+                    row += if tall { $rows } else { 1 };
+                }
+            }
+
+            #[target_feature(enable = $features)]
+            fn tile<const R: usize, const C: usize>(layer: &Layer, input: &[f32], column: usize, out: &mut [f32]) {
+                let (inputs, stride) = (layer.inputs, layer.stride);
+                let x: [&[f32]; R] = std::array::from_fn(|r| &input[r * inputs..][..inputs]);
+                let bias = &layer.bias[column..][..C * $lanes];
+                let mut sums = [[$splat(0.0); C]; R];
+                for c in 0..C {
+                    // SAFETY: `bias` holds C registers
+                    let bias = unsafe { $load(bias.as_ptr().add(c * $lanes)) };
+                    sums.iter_mut().for_each(|row| row[c] = bias);
+                }
+                for i in 0..inputs {
+                    let weight = &layer.weight[i * stride + column..][..C * $lanes];
+                    let mut w = [$splat(0.0); C];
+                    for c in 0..C {
+                        // SAFETY: `weight` holds C registers
+                        w[c] = unsafe { $load(weight.as_ptr().add(c * $lanes)) };
+                    }
+                    for r in 0..R {
+                        let x = $splat(x[r][i]);
+                        for c in 0..C {
+                            sums[r][c] = $fused(x, w[c], sums[r][c]);
+                        }
+                    }
+                }
+                for r in 0..R {
+                    let out = &mut out[r * stride + column..][..C * $lanes];
+                    for c in 0..C {
+                        // SAFETY: `out` holds C registers
+                        unsafe { $store(out.as_mut_ptr().add(c * $lanes), sums[r][c]) };
+                    }
+                }
+            }
+        }
+    };
+}
+
+// 4 rows: a weight is loaded once for four. 16 of 32 registers hold sums, or 8 of 16.
+#[cfg(target_arch = "x86_64")]
+tiled!(avx512, "avx512f", 16, 4, 4, _mm512_loadu_ps, _mm512_set1_ps, _mm512_fmadd_ps, _mm512_storeu_ps);
+#[cfg(target_arch = "x86_64")]
+tiled!(fma, "avx,fma", 8, 4, 2, _mm256_loadu_ps, _mm256_set1_ps, _mm256_fmadd_ps, _mm256_storeu_ps);
 
 #[cfg(test)]
 mod tests {
