@@ -12,6 +12,7 @@ mod integrity;
 mod links;
 mod mi;
 mod record;
+mod probe;
 mod report;
 mod stats;
 mod stores;
