@@ -128,7 +128,17 @@ impl Actors {
         for network in &networks {
             offsets.push(offsets[offsets.len() - 1] + network.parameters());
         }
-        Self { names, observation, output, messages, networks, offsets, steps: 0, scenario: Map::new(), file_sha256: String::new() }
+        Self {
+            names,
+            observation,
+            output,
+            messages,
+            networks,
+            offsets,
+            steps: 0,
+            scenario: Map::new(),
+            file_sha256: String::new(),
+        }
     }
 
     /// Learners.
@@ -249,8 +259,9 @@ impl Actors {
         let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).map_err(|e| e.to_string())?;
         let metadata = header.metadata().clone().unwrap_or_default();
         let json = metadata.get(HEADER).ok_or_else(|| format!("the metadata key {HEADER:?} is missing"))?;
-        let Header { version, learners: names, observation, messages, output_activation, steps, scenario, sha256, .. } =
-            serde_json::from_str(json).map_err(|e| format!("the metadata key {HEADER:?}: {e}"))?;
+        let Header {
+            version, learners: names, observation, messages, output_activation, steps, scenario, sha256, ..
+        } = serde_json::from_str(json).map_err(|e| format!("the metadata key {HEADER:?}: {e}"))?;
         let output = match output_activation.as_str() {
             "tanh" => Activation::Tanh,
             "sigmoid" => Activation::Sigmoid,
@@ -289,7 +300,10 @@ impl Actors {
         if digest(&params) != sha256 {
             return Err("its parameters do not match their digest: the file was changed or damaged".to_owned());
         }
-        Ok((Self { steps, scenario, file_sha256, ..Self::assemble(names, observation, output, messages, networks) }, params))
+        Ok((
+            Self { steps, scenario, file_sha256, ..Self::assemble(names, observation, output, messages, networks) },
+            params,
+        ))
     }
 
     /// Checks that these actors were trained in this world, given as every constant of both; actors that know no world
@@ -308,8 +322,10 @@ impl Actors {
         if keys.is_empty() {
             return Ok(());
         }
-        let differences: Vec<String> =
-            keys.iter().map(|key| format!("{key} was {} in training and is {} here", shown(trained, key), shown(here, key))).collect();
+        let differences: Vec<String> = keys
+            .iter()
+            .map(|key| format!("{key} was {} in training and is {} here", shown(trained, key), shown(here, key)))
+            .collect();
         Err(RunPolicyError::DoesNotFit { message: differences.join(", "), path: path.to_owned() })
     }
 

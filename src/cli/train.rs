@@ -10,7 +10,7 @@ use super::{Outcome, ui};
 use crate::Error;
 use crate::link::LINKS;
 use crate::registry::Spec;
-use crate::train::{self, Options, Protocol, TrainConfig};
+use crate::train::{self, Options, Protocol, TrainConfig, TrainError};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -110,6 +110,10 @@ impl Args {
     /// The configuration: the file's, then the flags'.
     fn config(&self) -> Result<TrainConfig, Error> {
         let own = self.resume.then(|| self.out.join("config.toml"));
+        if own.as_ref().is_some_and(|own| !own.exists()) {
+            let message = "there is no run to go on with; start it without --resume".to_owned();
+            return Err(TrainError::Resume { message, path: self.out.clone() }.into());
+        }
         let file = self.config.as_deref().or(own.as_deref()).map(TrainConfig::read).transpose()?;
         let spec = self.scenario.spec(file.as_ref().map(|c| c.scenario.clone()))?;
         let spec = spec.unwrap_or_else(|| Spec::new("simple_spread"));

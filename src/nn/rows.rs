@@ -200,7 +200,9 @@ macro_rules! tiled {
                 for c in 0..C {
                     // SAFETY: `bias` holds C registers
                     let bias = unsafe { $load(bias.as_ptr().add(c * $lanes)) };
-                    sums.iter_mut().for_each(|row| row[c] = bias);
+                    for row in &mut sums {
+                        row[c] = bias;
+                    }
                 }
                 for i in 0..inputs {
                     let weight = &layer.weight[i * stride + column..][..C * $lanes];
@@ -254,8 +256,7 @@ mod tests {
         for widths in [&[54, 64, 64, 2][..], &[7, 20, 5], &[1, 1], &[3, 130, 17]] {
             let (mlp, params, input) = case(widths, 11);
             let rows = Rows::new(&mlp, &params);
-            let (mut scratch, mut alone, mut tape) =
-                (RowsScratch::default(), RowsScratch::default(), Tape::default());
+            let (mut scratch, mut alone, mut tape) = (RowsScratch::default(), RowsScratch::default(), Tape::default());
             let together = rows.forward(&input, 11, &mut scratch).to_vec();
             let reference = mlp.forward(&params, &input, 11, &mut tape);
             let error = together.iter().zip(reference).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);

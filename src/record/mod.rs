@@ -87,7 +87,8 @@ pub trait Policy: Send + Sync {
 
     /// What every agent sends, element counts.
     fn message_widths(&self, scenario: &dyn Scenario) -> Vec<usize> {
-        let width = |(i, agent): (usize, &AgentSpec)| if agent.communicator { self.message_width(scenario, i) } else { 0 };
+        let width =
+            |(i, agent): (usize, &AgentSpec)| if agent.communicator { self.message_width(scenario, i) } else { 0 };
         scenario.agents().iter().enumerate().map(width).collect()
     }
 }

@@ -100,7 +100,8 @@ impl Recording<'_> {
         let mut worlds = Worlds::new(scenario, count);
         nodes.iter().enumerate().for_each(|(i, node)| worlds.reset(i, &mut node.stream("world")));
         let mut rules: Vec<_> = nodes.iter().map(|node| node.stream("scripted")).collect();
-        let mut links: Vec<_> = children("link").iter().map(|node| self.link.start(communicators.len(), node)).collect();
+        let mut links: Vec<_> =
+            children("link").iter().map(|node| self.link.start(communicators.len(), node)).collect();
         let mut policy = self.policy.start_together(scenario, first, &children("policy"));
         let start = |i: u64| Episode::with_capacity(layout, first + i, steps);
         let mut episodes: Vec<Episode> = (0..count as u64).map(start).collect();
@@ -121,8 +122,7 @@ impl Recording<'_> {
             if t == steps {
                 break; // the last row has no action
             }
-            let view =
-                View { state: worlds.states(), observations: &observations, messages: &messages, link: &link };
+            let view = View { state: worlds.states(), observations: &observations, messages: &messages, link: &link };
             policy.act(&view, &mut actions);
             worlds.scripted(&mut rules, &mut actions);
             worlds.step(&actions, &mut rewards, &mut team);
@@ -133,7 +133,9 @@ impl Recording<'_> {
                 episode.rewards.iter_mut().zip(own).for_each(|(column, &r)| column.push(r));
             }
         }
-        episodes.iter_mut().for_each(|episode| episode.steps = steps);
+        for episode in &mut episodes {
+            episode.steps = steps;
+        }
         episodes
     }
 

@@ -96,9 +96,8 @@ impl ActionNoise {
     /// The factor on the process in episode number `episode`; 1 for noise that does not fall, 0 for none.
     pub fn scale(&self, episode: u64) -> f64 {
         match *self {
-            Self::None => 0.0,
+            Self::None | Self::OrnsteinUhlenbeck { episodes: 0, .. } => 0.0,
             Self::Gaussian(_) => 1.0,
-            Self::OrnsteinUhlenbeck { episodes: 0, .. } => 0.0,
             Self::OrnsteinUhlenbeck { scale, episodes, .. } => {
                 scale * episodes.saturating_sub(episode) as f64 / episodes as f64
             }

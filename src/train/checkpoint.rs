@@ -55,7 +55,7 @@ fn visit(trainer: &mut Trainer, see: See<'_>) -> Result<(), String> {
     see("metrics", Slot::Doubles(&mut rows))?;
     trainer.metrics = rows.chunks(MetricsRow::NUMBERS).map(MetricsRow::from_numbers).collect();
     let tests = &mut trainer.tests;
-    let mut rows: Vec<f64> = tests.rows.iter().flat_map(TestRow::to_numbers).collect();
+    let mut rows: Vec<f64> = tests.rows.iter().copied().flat_map(TestRow::to_numbers).collect();
     see("tests", Slot::Doubles(&mut rows))?;
     tests.rows = rows.chunks(TestRow::NUMBERS).map(TestRow::from_numbers).collect();
     see("best.actors", Slot::Floats(&mut tests.best.params))?;
@@ -99,7 +99,11 @@ fn visit_estimator(name: &str, estimator: &mut Estimator, see: See<'_>) -> Resul
     let [mut messages, mut actions] = estimator.fresh().map(<[f32]>::to_vec);
     see(&format!("{name}_fresh.messages"), Slot::Floats(&mut messages))?;
     see(&format!("{name}_fresh.actions"), Slot::Floats(&mut actions))?;
-    if estimator.restore_fresh(messages, actions) { Ok(()) } else { Err(format!("{name}_fresh: its lengths do not fit")) }
+    if estimator.restore_fresh(messages, actions) {
+        Ok(())
+    } else {
+        Err(format!("{name}_fresh: its lengths do not fit"))
+    }
 }
 
 /// Writes all files; the state, by which a run goes on, last.

@@ -89,7 +89,8 @@ mod tests {
         for ours in [".metrics.parquet.a1B2c3", ".state.safetensors.ABCdef", ".config.toml.000000"] {
             assert!(is_leftover(ours), "{ours}");
         }
-        for foreign in ["metrics.parquet.a1B2c3", ".thesis.tex.a1B2c3", ".metrics.parquet.a1B2c34", ".metrics.parquet"] {
+        for foreign in ["metrics.parquet.a1B2c3", ".thesis.tex.a1B2c3", ".metrics.parquet.a1B2c34", ".metrics.parquet"]
+        {
             assert!(!is_leftover(foreign), "{foreign}");
         }
     }

@@ -79,7 +79,7 @@ impl TestRow {
     /// Numbers that a row is in a checkpoint.
     pub(super) const NUMBERS: usize = 4;
 
-    pub(super) fn to_numbers(&self) -> [f64; Self::NUMBERS] {
+    pub(super) fn to_numbers(self) -> [f64; Self::NUMBERS] {
         [self.step as f64, self.episode as f64, self.episode_return, self.loss_rate]
     }
 

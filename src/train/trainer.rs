@@ -304,6 +304,11 @@ impl Trainer {
         self.dumie.as_ref().map(|d| [&d.jsd.ring, &d.club.ring])
     }
 
+    /// The rows of metrics so far.
+    pub fn metrics(&self) -> &[MetricsRow] {
+        &self.metrics
+    }
+
     /// Mean training return of the last logging interval.
     pub(super) fn return_mean(&self) -> Option<f64> {
         self.metrics.last().and_then(|row| row.values[0])

@@ -124,7 +124,9 @@ fn a_run_that_goes_on_for_longer_is_the_run_of_that_length() {
     run(standard(4000), &long, &Options::default());
     run(standard(2510), &grown, &Options::default());
     run(standard(4000), &grown, &Options { resume: true, ..Options::default() });
-    for file in LEARNED.into_iter().chain(["checkpoint/state.safetensors", "config.toml", "evaluation_standard.parquet"]) {
+    for file in
+        LEARNED.into_iter().chain(["checkpoint/state.safetensors", "config.toml", "evaluation_standard.parquet"])
+    {
         assert!(bytes(&long, file) == bytes(&grown, file), "{file}");
     }
 }
@@ -142,7 +144,10 @@ fn worlds_stepped_together_are_the_papers_order_as_long_as_no_update_lies_betwee
     assert_eq!(updates, [30; 5], "one update per 100 steps after the first 1024, however many worlds");
     for file in LEARNED {
         for envs in ["2", "3", "4"] {
-            assert!(bytes(&dir.path().join("1"), file) == bytes(&dir.path().join(envs), file), "{file} of {envs} worlds");
+            assert!(
+                bytes(&dir.path().join("1"), file) == bytes(&dir.path().join(envs), file),
+                "{file} of {envs} worlds"
+            );
         }
         assert!(bytes(&dir.path().join("1"), file) != bytes(&dir.path().join("16"), file));
     }
@@ -197,7 +202,10 @@ fn the_paper_protocol_writes_what_the_command_would() {
     let own = bytes(&path, "evaluation.parquet");
     std::fs::remove_file(path.join("evaluation.parquet")).unwrap();
     let words = ["evaluate", path.to_str().unwrap(), "--episodes", "4"];
-    assert_eq!(assert_cmd::Command::new(env!("CARGO_BIN_EXE_ccmarl")).args(words).output().unwrap().status.code(), Some(0));
+    assert_eq!(
+        assert_cmd::Command::new(env!("CARGO_BIN_EXE_ccmarl")).args(words).output().unwrap().status.code(),
+        Some(0)
+    );
     assert!(own == bytes(&path, "evaluation.parquet"));
 }
 
@@ -213,9 +221,17 @@ fn a_kill_before_the_first_checkpoint_leaves_no_run_and_one_amid_a_write_leaves_
     run(config("maddpg", 500), &path, &Options::default());
     assert!(!dir.path().join(".run.partial").exists());
     for leftover in [".metrics.parquet.a1B2c3", "checkpoint/.state.safetensors.XyZ123"] {
-        std::fs::write(path.join(leftover), b"half").unwrap();
+        ccmarl::io::write_atomic(&path.join(leftover), b"half").unwrap();
     }
     run(config("maddpg", 1000), &path, &resume);
+    let words = ["train", "--resume", "--out", dir.path().join("nosuch").to_str().unwrap()].map(ToOwned::to_owned);
+    let output = assert_cmd::Command::new(env!("CARGO_BIN_EXE_ccmarl")).args(words).output().unwrap();
+    let err = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    assert!(
+        err.starts_with("error: cannot resume: there is no run to go on with; start it without --resume: "),
+        "{err}"
+    );
     let mut names: Vec<_> = walk(&path);
     names.sort();
     let expected = [
@@ -227,7 +243,7 @@ fn a_kill_before_the_first_checkpoint_leaves_no_run_and_one_amid_a_write_leaves_
         "timings.parquet",
     ];
     assert_eq!(names, expected);
-    std::fs::write(path.join(".metrics.parquet.a1B2c3"), b"half").unwrap();
+    ccmarl::io::write_atomic(&path.join(".metrics.parquet.a1B2c3"), b"half").unwrap();
     run(config("maddpg", 500), &path, &Options { force: true, ..Options::default() });
 }
 
@@ -239,7 +255,7 @@ fn a_damaged_checkpoint_is_refused() {
     let mut state = bytes(&path, "checkpoint/state.safetensors");
     let last = state.len() - 5;
     state[last] ^= 16;
-    std::fs::write(path.join("checkpoint/state.safetensors"), state).unwrap();
+    ccmarl::io::write_atomic(&path.join("checkpoint/state.safetensors"), &state).unwrap();
     let resume = Options { resume: true, ..Options::default() };
     let error = train(config("maddpg", 900), &path, &resume, &mut |_| {}, &AtomicBool::new(false)).unwrap_err();
     assert!(error.to_string().contains("its content does not match its digest"), "{error}");
@@ -382,7 +398,10 @@ fn a_run_that_diverges_stops_names_step_and_tensor_and_keeps_the_last_good_check
     wild.checkpoint_every = 1;
     let error = train(wild.clone(), &path, &Options::default(), &mut |_| {}, &AtomicBool::new(false)).unwrap_err();
     let error = error.to_string();
-    assert!(error.starts_with("the run diverged at step 1") && error.contains(".weight is no longer finite; "), "{error}");
+    assert!(
+        error.starts_with("the run diverged at step 1") && error.contains(".weight is no longer finite; "),
+        "{error}"
+    );
     assert!(error.contains("the last good checkpoint is kept"), "{error}");
     let mut kept = Trainer::new(wild.resolve().unwrap(), &path).unwrap();
     kept.resume().unwrap();
@@ -395,7 +414,8 @@ fn shaping_a_preset_that_has_none_is_refused_with_the_one_that_has() {
         let mut shaped = config(algorithm, 500);
         shaped.dumie.alpha = Some(0.01);
         let error = shaped.resolve().unwrap_err().to_string();
-        let expected = format!("dumie.alpha: {algorithm} is not shaped, found 0.01: take cc-maddpg with --prior {prior}, ");
+        let expected =
+            format!("dumie.alpha: {algorithm} is not shaped, found 0.01: take cc-maddpg with --prior {prior}, ");
         assert!(error.starts_with(&expected), "{error}");
     }
     let mut unshaped = config("maddpg", 500);
