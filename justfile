@@ -46,6 +46,10 @@ tables:
 interop:
     tests/interop/run.sh
 
+# Kills training runs at random moments, resumes them and compares their bytes (needs a release build)
+kill-training *args:
+    tests/interop/kill_training.sh {{args}}
+
 # Kills recordings at random moments and recovers them (needs a release build and python3)
 kill *args:
     tests/interop/kill.sh {{args}}

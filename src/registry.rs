@@ -3,6 +3,8 @@
 //! A plugin is written `name`, `name:value` or as a JSON table on the command line, and `{ name = …, … }` in TOML and JSON. Everything
 //! that knows plugins (help, `list`, "did you mean", contract tests) derives from the slices.
 
+use std::collections::BTreeMap;
+
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::{Map, Value};
@@ -231,6 +233,23 @@ pub fn resolved(name: &str, parameters: &impl Serialize) -> Map<String, Value> {
         map.extend(fields);
     }
     map
+}
+
+/// Every value of a TOML document under its dotted name.
+pub fn dotted(value: &toml::Value) -> BTreeMap<String, String> {
+    fn walk(prefix: &str, value: &toml::Value, out: &mut BTreeMap<String, String>) {
+        let toml::Value::Table(table) = value else {
+            out.insert(prefix.to_owned(), value.to_string());
+            return;
+        };
+        for (key, value) in table {
+            let name = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
+            walk(&name, value, out);
+        }
+    }
+    let mut out = BTreeMap::new();
+    walk("", value, &mut out);
+    out
 }
 
 /// The entry called `name`.

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use candle_core::{DType, Device};
 use candle_nn::VarBuilder;
 use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
 use sha2::{Digest as _, Sha256};
 
 use crate::nn::{Activation, Mlp, NnError, Tape, from_tensors, to_tensors};
@@ -32,6 +33,9 @@ struct Header {
     output_activation: String,
     /// Environment steps that trained them.
     steps: u64,
+    /// The scenario that they were trained in, every constant.
+    #[serde(default, skip_serializing_if = "Map::is_empty")]
+    scenario: Map<String, Value>,
     /// SHA-256 of all parameters in order, little-endian.
     sha256: String,
 }
@@ -89,6 +93,10 @@ pub struct Actors {
     pub offsets: Vec<usize>,
     /// Environment steps that trained the parameters these shapes were read with; 0 for fresh ones.
     pub steps: u64,
+    /// The scenario that they are trained in, every constant; empty where it is not known.
+    pub scenario: Map<String, Value>,
+    /// SHA-256 of the file that they were read from; empty for fresh ones.
+    pub file_sha256: String,
 }
 
 impl Actors {
@@ -120,7 +128,17 @@ impl Actors {
         for network in &networks {
             offsets.push(offsets[offsets.len() - 1] + network.parameters());
         }
-        Self { names, observation, output, messages, networks, offsets, steps: 0 }
+        Self {
+            names,
+            observation,
+            output,
+            messages,
+            networks,
+            offsets,
+            steps: 0,
+            scenario: Map::new(),
+            file_sha256: String::new(),
+        }
     }
 
     /// Learners.
@@ -201,6 +219,7 @@ impl Actors {
             hidden_activation: "relu".to_owned(),
             output_activation: if self.low() < 0.0 { "tanh" } else { "sigmoid" }.to_owned(),
             steps,
+            scenario: self.scenario.clone(),
             sha256: digest(params),
         };
         // one key only: the crate keeps metadata in a hash map, whose order would change the bytes
@@ -226,11 +245,13 @@ impl Actors {
     }
 
     fn from_bytes(bytes: Vec<u8>) -> Result<(Self, Vec<f32>), String> {
+        let file_sha256 = hex(&Sha256::digest(&bytes));
         let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).map_err(|e| e.to_string())?;
         let metadata = header.metadata().clone().unwrap_or_default();
         let json = metadata.get(HEADER).ok_or_else(|| format!("the metadata key {HEADER:?} is missing"))?;
-        let Header { version, learners: names, observation, messages, output_activation, steps, sha256, .. } =
-            serde_json::from_str(json).map_err(|e| format!("the metadata key {HEADER:?}: {e}"))?;
+        let Header {
+            version, learners: names, observation, messages, output_activation, steps, scenario, sha256, ..
+        } = serde_json::from_str(json).map_err(|e| format!("the metadata key {HEADER:?}: {e}"))?;
         let output = match output_activation.as_str() {
             "tanh" => Activation::Tanh,
             "sigmoid" => Activation::Sigmoid,
@@ -269,7 +290,33 @@ impl Actors {
         if digest(&params) != sha256 {
             return Err("its parameters do not match their digest: the file was changed or damaged".to_owned());
         }
-        Ok((Self { steps, ..Self::assemble(names, observation, output, messages, networks) }, params))
+        Ok((
+            Self { steps, scenario, file_sha256, ..Self::assemble(names, observation, output, messages, networks) },
+            params,
+        ))
+    }
+
+    /// Checks that these actors were trained in this world, given as every constant of both; actors that know no world
+    /// fit every one.
+    ///
+    /// # Errors
+    /// [`RunPolicyError::DoesNotFit`] that names each constant that differs.
+    pub fn check_world(
+        trained: &Map<String, Value>,
+        here: &Map<String, Value>,
+        path: &Path,
+    ) -> Result<(), RunPolicyError> {
+        let shown = |map: &Map<String, Value>, key: &str| map.get(key).map_or("unset".to_owned(), ToString::to_string);
+        let mut keys: Vec<&String> = trained.keys().chain(here.keys().filter(|k| !trained.contains_key(*k))).collect();
+        keys.retain(|key| trained.get(*key) != here.get(*key));
+        if keys.is_empty() {
+            return Ok(());
+        }
+        let differences: Vec<String> = keys
+            .iter()
+            .map(|key| format!("{key} was {} in training and is {} here", shown(trained, key), shown(here, key)))
+            .collect();
+        Err(RunPolicyError::DoesNotFit { message: differences.join(", "), path: path.to_owned() })
     }
 
     /// Least value of an action component; the largest is 1.

@@ -17,7 +17,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Actors, Team};
+use super::{Actors, Team, TeamScratch};
 use crate::nn::{Activation, Adam, AdamConfig, Input, Mlp, NnError, Packed, Params, Passes, TILE, clip_norm};
 use crate::rng::Seeds;
 use crate::schema::AgentSpec;
@@ -187,6 +187,7 @@ pub struct Networks {
 struct Scratch {
     team: Team,
     target_team: Team,
+    acting: TeamScratch,
     critic: Packed,
     target_critic: Packed,
     critic_packed_grads: Packed,
@@ -274,6 +275,7 @@ impl Maddpg {
         let Scratch {
             joint,
             target_team,
+            acting,
             passes,
             grad_q,
             target,
@@ -282,7 +284,7 @@ impl Maddpg {
             target_critic: target_packed,
             ..
         } = &mut self.scratch;
-        target_team.load(actors, &self.params.target_actors.read());
+        target_team.load_forward(actors, &self.params.target_actors.read());
         critic.pack(&self.params.target_critic.read(), target_packed);
         packed.wanted = widths.observations..widths.joint();
         critic.pack(&self.params.critic.read(), packed);
@@ -294,8 +296,8 @@ impl Maddpg {
             // y = r + bonus + γ Q⁻(o', π⁻(o', M'))
             joint.resize(rows * widths.joint(), 0.0);
             widths.put(joint, tile.next_observations, 0);
-            target_team.act(actors, tile.next_observations, tile.next_link, rows);
-            (0..actors.len()).for_each(|i| widths.put(joint, target_team.actions(i), widths.action(actors, i).start));
+            target_team.act(actors, tile.next_observations, tile.next_link, rows, acting);
+            (0..actors.len()).for_each(|i| widths.put(joint, acting.actions(i), widths.action(actors, i).start));
             let q = critic.forward_packed(target_packed, widths.input(joint), rows, passes);
             target.clear();
             target.extend(tile.reward.iter().zip(q).map(|(r, q)| r + gamma * q));
@@ -324,7 +326,7 @@ impl Maddpg {
         let widths = Widths::of(&self.actors);
         let (actors, critic) = (&self.actors, &self.critic);
         let Scratch {
-            joint, team, passes, grad_q, grad_joint, grad_action, actor_grads, critic: packed, ..
+            joint, team, acting, passes, grad_q, grad_joint, grad_action, actor_grads, critic: packed, ..
         } = &mut self.scratch;
         team.load(actors, &self.params.actors.read());
         team.clear_grads(actors);
@@ -339,7 +341,7 @@ impl Maddpg {
         for start in (0..batch.rows).step_by(TILE) {
             let rows = TILE.min(batch.rows - start);
             let tile = Tile::of(batch, start, rows, widths, n);
-            team.act(actors, tile.observations, tile.link, rows);
+            team.act(actors, tile.observations, tile.link, rows, acting);
             joint.resize(rows * widths.joint(), 0.0);
             widths.put(joint, tile.observations, 0);
             grad_q.clear();
@@ -351,7 +353,7 @@ impl Maddpg {
                     widths.put(joint, tile.actions, widths.observations);
                 }
                 for i in fresh.clone() {
-                    widths.put(joint, team.actions(i), widths.action(actors, i).start);
+                    widths.put(joint, acting.actions(i), widths.action(actors, i).start);
                 }
                 let input = widths.input(joint);
                 let q = critic.forward_packed(packed, input, rows, passes);
@@ -363,11 +365,11 @@ impl Maddpg {
                     let penalised = if fresh_in_each == n { widths.actions } else { width };
                     let penalty = 2.0 * self.config.action_penalty / (batch.rows * penalised) as f32;
                     grad_action.clear();
-                    let own = grad_joint.chunks_exact(widths.actions).zip(team.actions(i).chunks_exact(width));
+                    let own = grad_joint.chunks_exact(widths.actions).zip(acting.actions(i).chunks_exact(width));
                     for (grad, a) in own {
                         grad_action.extend(grad[from..from + width].iter().zip(a).map(|(g, a)| g + penalty * a));
                     }
-                    team.backward(actors, i, tile.observations, rows, grad_action);
+                    team.backward(actors, i, (tile.observations, rows), grad_action, acting);
                 }
             }
         }
@@ -401,7 +403,8 @@ struct Tile<'a> {
 
 impl<'a> Tile<'a> {
     fn of(batch: &'a Batch, start: usize, rows: usize, widths: Widths, learners: usize) -> Self {
-        let [o, a, l] = [widths.observations, widths.actions, learners * learners].map(|w| start * w..(start + rows) * w);
+        let [o, a, l] =
+            [widths.observations, widths.actions, learners * learners].map(|w| start * w..(start + rows) * w);
         Self {
             observations: &batch.observations[o.clone()],
             next_observations: &batch.next_observations[o],
@@ -551,8 +554,7 @@ mod tests {
             let mut learner = Maddpg::new(&agents, Activation::Sigmoid, config, &Seeds::new(4)).unwrap();
             learner.td_pass(&batch, &[], false);
             let (found, _) = learner.actor_pass(&batch);
-            let groups: &[&[usize]] =
-                if actor_step == ActorStep::Joint { &[&[0, 1], &[0, 1]] } else { &[&[0], &[1]] };
+            let groups: &[&[usize]] = if actor_step == ActorStep::Joint { &[&[0, 1], &[0, 1]] } else { &[&[0], &[1]] };
             let mean = groups.iter().map(|fresh| objective(&learner, &batch, fresh)).sum::<f64>() / 2.0;
             assert!((found - mean).abs() < 1e-6, "{found} and {mean}");
             let start = learner.params.actors.read().to_vec();

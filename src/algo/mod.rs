@@ -11,7 +11,7 @@ mod team;
 pub use actors::{Actors, RunPolicyError};
 pub use maddpg::{ActorStep, Batch, Maddpg, MaddpgConfig, Masks, Messages, UpdateMetrics};
 pub use presets::Preset;
-pub use team::Team;
+pub use team::{Team, TeamScratch};
 
 use crate::registry::{Entry, RegistryError};
 

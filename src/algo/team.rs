@@ -7,16 +7,21 @@
 use super::Actors;
 use crate::nn::{Input, Packed, Passes};
 
-/// Actors with their parameters laid out, and the buffers in which they act; nothing is allocated once it is warm.
-#[derive(Debug, Default)]
+/// Actors with their parameters laid out.
+#[derive(Clone, Debug, Default)]
 pub struct Team {
+    packed: Vec<Packed>,
+    grads: Vec<Packed>,
+}
+
+/// The buffers in which a team acts; nothing is allocated once they are warm.
+#[derive(Clone, Debug, Default)]
+pub struct TeamScratch {
     members: Vec<Member>,
 }
 
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 struct Member {
-    packed: Packed,
-    grads: Packed,
     /// Observations with the lost ones zeroed, `[rows, O]`; unused when nothing was lost.
     input: Vec<f32>,
     lossless: bool,
@@ -24,54 +29,75 @@ struct Member {
 }
 
 impl Team {
-    /// Takes over parameters.
+    /// Takes over parameters, for acting and learning.
     pub fn load(&mut self, actors: &Actors, params: &[f32]) {
-        self.members.resize_with(actors.len(), Member::default);
-        for (i, member) in self.members.iter_mut().enumerate() {
-            if actors.messages && member.packed.columns.is_empty() {
-                member.packed.columns = columns(actors, i);
-                member.grads.columns.clone_from(&member.packed.columns);
+        self.load_forward(actors, params);
+        for (i, packed) in self.packed.iter_mut().enumerate() {
+            actors.networks[i].pack_backward(actors.slice(params, i), packed);
+        }
+        self.grads.resize_with(actors.len(), Packed::default);
+        self.grads.iter_mut().zip(&self.packed).for_each(|(grads, packed)| grads.columns.clone_from(&packed.columns));
+    }
+
+    /// Takes over parameters, for acting alone.
+    pub fn load_forward(&mut self, actors: &Actors, params: &[f32]) {
+        self.packed.resize_with(actors.len(), Packed::default);
+        for (i, packed) in self.packed.iter_mut().enumerate() {
+            if actors.messages && packed.columns.is_empty() {
+                packed.columns = columns(actors, i);
             }
-            actors.networks[i].pack(actors.slice(params, i), &mut member.packed);
+            actors.networks[i].pack_forward(actors.slice(params, i), packed);
         }
     }
 
     /// All actors act on `rows` rows of `observations` `[rows, O]` under the link bits `[rows, N²]`, sender by receiver.
-    pub fn act(&mut self, actors: &Actors, observations: &[f32], link: &[bool], rows: usize) {
-        for (i, member) in self.members.iter_mut().enumerate() {
+    /// A row's actions do not depend on the rows beside it, to the bit.
+    pub fn act(&self, actors: &Actors, observations: &[f32], link: &[bool], rows: usize, scratch: &mut TeamScratch) {
+        scratch.members.resize_with(actors.len(), Member::default);
+        for (i, (packed, member)) in self.packed.iter().zip(&mut scratch.members).enumerate() {
             member.lossless = !actors.messages || all_received(actors.len(), i, &link[..rows * actors.len().pow(2)]);
             if !member.lossless {
                 member.receive(actors, i, observations, link, rows);
             }
-            let Member { packed, input, lossless, passes, .. } = member;
+            let Member { input, lossless, passes } = member;
             let input = if *lossless { observations } else { input };
             actors.networks[i].forward_packed(packed, of(actors, i, input), rows, passes);
         }
     }
 
-    /// What actor `i` did on the rows of the last [`Self::act`], `[rows, action]`.
-    pub fn actions(&self, i: usize) -> &[f32] {
-        self.members[i].passes.output()
-    }
-
     /// Sets the gradients of all actors to zero.
     pub(super) fn clear_grads(&mut self, actors: &Actors) {
-        for (network, member) in actors.networks.iter().zip(&mut self.members) {
-            network.clear_grads(&mut member.grads);
+        for (network, grads) in actors.networks.iter().zip(&mut self.grads) {
+            network.clear_grads(grads);
         }
     }
 
-    /// Backward pass of actor `i` on the rows of the last [`Self::act`], given ∂L/∂action `[rows, action]`.
-    pub(super) fn backward(&mut self, actors: &Actors, i: usize, observations: &[f32], rows: usize, grad: &[f32]) {
-        let Member { packed, grads, input, lossless, passes } = &mut self.members[i];
+    /// Backward pass of actor `i` on the rows of the last [`Self::act`] in `scratch`, given ∂L/∂action `[rows, action]`.
+    pub(super) fn backward(
+        &mut self,
+        actors: &Actors,
+        i: usize,
+        (observations, rows): (&[f32], usize),
+        grad: &[f32],
+        scratch: &mut TeamScratch,
+    ) {
+        let Member { input, lossless, passes } = &mut scratch.members[i];
         let input = of(actors, i, if *lossless { observations } else { input });
-        actors.networks[i].backward_packed(packed, input, rows, passes, grad, Some(grads), None);
+        let grads = Some(&mut self.grads[i]);
+        actors.networks[i].backward_packed(&self.packed[i], input, rows, passes, grad, grads, None);
     }
 
     /// Writes actor `i`'s gradients in the order of its parameters.
     pub(super) fn grads(&self, actors: &Actors, i: usize, flat: &mut [f32]) {
         flat.fill(0.0);
-        actors.networks[i].unpack_grads(&self.members[i].grads, flat);
+        actors.networks[i].unpack_grads(&self.grads[i], flat);
+    }
+}
+
+impl TeamScratch {
+    /// What actor `i` did on the rows of the last [`Team::act`], `[rows, action]`.
+    pub fn actions(&self, i: usize) -> &[f32] {
+        self.members[i].passes.output()
     }
 }
 
@@ -148,14 +174,18 @@ mod tests {
             let params = actors.init(&mut rng);
             let mut team = Team::default();
             team.load(&actors, &params);
-            team.act(&actors, &observations, &link, rows);
+            let [mut scratch, mut single] = [(); 2].map(|()| TeamScratch::default());
+            team.act(&actors, &observations, &link, rows, &mut scratch);
             let (mut input, mut tape) = (Vec::new(), Tape::default());
             for row in 0..rows {
+                team.act(&actors, &observations[row * 12..], &link[row * 9..], 1, &mut single);
                 for i in 0..3 {
                     input.clear();
                     actors.push_input(i, &observations[row * 12..], &link[row * 9..], &mut input);
                     let alone = actors.act(&params, i, &input, 1, &mut tape);
-                    for (a, b) in alone.iter().zip(&team.actions(i)[row * (1 + i)..]) {
+                    let among = &scratch.actions(i)[row * (1 + i)..][..1 + i];
+                    assert_eq!(single.actions(i), among, "row {row}, actor {i}: alone and among others");
+                    for (a, b) in alone.iter().zip(among) {
                         assert!((a - b).abs() < 1e-6, "row {row}, actor {i}: {a} and {b}");
                     }
                 }

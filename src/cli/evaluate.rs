@@ -7,12 +7,11 @@ use serde_json::json;
 use super::args::end_on_signals;
 use super::{Outcome, ui};
 use crate::Error;
-use crate::algo::Actors;
 use crate::io::IoError;
 use crate::link::suite;
-use crate::registry::{RegistryError, Spec};
+use crate::record::{ActionNoise, Trained};
 use crate::scenario;
-use crate::train::{TrainConfig, TrainError, evaluate, write_evaluation};
+use crate::train::{TrainConfig, evaluate, evaluation_seed, write_evaluation};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -51,7 +50,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         return Err(Error::from(IoError::Missing(args.run.clone())).into());
     }
     let config = TrainConfig::read(&file).and_then(TrainConfig::resolve).map_err(Error::from)?;
-    let trained = Actors::load(&args.run).map_err(|e| Error::from(RegistryError::Data(e.to_string())))?.0.steps;
+    let scenario = scenario::build(&config.scenario).map_err(Error::from)?;
+    let team = Trained::load(&args.run, &*scenario, ActionNoise::None).map_err(Error::from)?;
+    let trained = team.actors.steps;
     if trained < config.steps {
         ui::say(&format!(
             "warning: trained for {trained} of {} steps; go on with `ccmarl train --resume`",
@@ -59,11 +60,11 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         ));
     }
     let channels = suite(&args.suite).map_err(Error::from)?;
-    let policy = Spec::new("run").with("path", args.run.to_string_lossy());
     let bar = ui::progress(channels.len() as u64, "channels");
-    let rows = evaluate(&config, &policy, &channels, args.episodes, &mut |_| bar.inc(1)).map_err(Error::from)?;
+    let seed = evaluation_seed(&config);
+    let rows = evaluate(&*scenario, &team, &channels, args.episodes, seed, &mut |_| bar.inc(1)).map_err(Error::from)?;
     bar.finish_and_clear();
-    write_evaluation(&args.run, &config, &rows).map_err(Error::from)?;
+    write_evaluation(&args.run, &config, team.actors.len(), &rows).map_err(Error::from)?;
 
     let mut summary = Vec::new();
     for channel in &channels {
@@ -100,7 +101,6 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
                 })
                 .collect();
             ui::print_table(&["channel", "return", "± over episodes", "messages lost", "episodes"], &rows)?;
-            let scenario = scenario::build(&config.scenario).map_err(TrainError::from).map_err(Error::from)?;
             ui::say(&format!("return: {}", scenario.reward_convention()));
         }
     }

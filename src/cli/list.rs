@@ -29,6 +29,7 @@ const KINDS: &[(&str, List)] = &[
     ("figure", |kind| listed(kind, crate::figure::FIGURES)),
     ("suite", suites),
     ("channel", channels),
+    ("metric", metrics),
 ];
 
 /// One plugin as `list` prints it.
@@ -143,6 +144,23 @@ fn suites(kind: &'static str) -> Vec<Listed> {
 fn channels(kind: &'static str) -> Vec<Listed> {
     let all = link::SUITES.iter().flat_map(|suite| link::suite(suite).into_iter().flatten());
     all.map(|channel| tested(kind, channel.id, format!("the link {} as test channel", channel.spec))).collect()
+}
+
+/// The columns of a run's tables.
+fn metrics(kind: &'static str) -> Vec<Listed> {
+    use crate::train::{METRIC_COLUMNS, METRIC_KEYS, STANDARD_COLUMNS, TIMING_COLUMNS};
+    let metrics = METRIC_KEYS.iter().chain(&METRIC_COLUMNS).map(|column| (column, "metrics.parquet of a run"));
+    let timings = TIMING_COLUMNS.iter().map(|column| (column, "timings.parquet of a run"));
+    // `step` is among the metrics
+    let tests = STANDARD_COLUMNS.iter().skip(1).map(|column| (column, "evaluation_standard.parquet of a run"));
+    let listed = |(&(name, summary), reference): (&(&'static str, &'static str), &'static str)| Listed {
+        kind,
+        name,
+        syntax: name.to_owned(),
+        summary: summary.to_owned(),
+        reference,
+    };
+    metrics.chain(timings).chain(tests).map(listed).collect()
 }
 
 fn tested(kind: &'static str, name: &'static str, summary: String) -> Listed {

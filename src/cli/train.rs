@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use clap::ValueEnum;
 use serde_json::json;
 
 use super::args::{ScenarioArgs, stop_flag};
@@ -9,7 +10,7 @@ use super::{Outcome, ui};
 use crate::Error;
 use crate::link::LINKS;
 use crate::registry::Spec;
-use crate::train::{self, Options, TrainConfig};
+use crate::train::{self, Options, Protocol, TrainConfig, TrainError};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -17,11 +18,16 @@ Examples:
   ccmarl train --scenario simple_tag --agents 6 --algorithm cc-maddpg --prior markov:heavy --out runs/matched
   ccmarl train --config run.toml --out runs/y
   ccmarl train --out runs/x --resume
+  ccmarl train --out runs/x --resume --steps 8000000
 
 Without --scenario and --config it is simple_spread with 3 agents.
-The run directory holds config.toml (fully resolved), metrics.parquet, TensorBoard events and checkpoint/, saved every
-2000 updates and at the end. Ctrl-C saves and exits 4; --resume reads the run's own config.toml and goes on from its last
-checkpoint, to the same bytes as a run that was never stopped.";
+The run directory holds config.toml (fully resolved), metrics.parquet, timings.parquet, TensorBoard events and checkpoint/,
+saved every 2000 updates and at the end (`ccmarl list metric` says what each column means). Ctrl-C saves and exits 4;
+--resume reads the run's own config.toml and goes on from its last checkpoint, to the same bytes as a run that was never
+stopped; with --steps it goes on for longer. Any other changed setting is refused.
+--evaluate paper tests the team at the end, as `ccmarl evaluate` does; --evaluate standard tests it on 32 episodes over the
+training link every 20000 steps and at the end the best on 320, over that link and on the eight channels
+(evaluation_standard.parquet).";
 
 /// Arguments of `train`.
 #[derive(Debug, clap::Args)]
@@ -50,6 +56,15 @@ pub(super) struct Args {
     /// Weight of CLUB on lost messages [default: the algorithm's]
     #[arg(long)]
     beta: Option<f64>,
+    /// Worlds stepped together [default: the episodes between two updates, the same run as with 1]
+    #[arg(long)]
+    envs: Option<usize>,
+    /// Tests that belong to the run: none, paper or standard [default: none]
+    #[arg(long, value_enum, value_name = "PROTOCOL")]
+    evaluate: Option<Evaluate>,
+    /// Environment steps between two tests of --evaluate standard [default: 20000]
+    #[arg(long, value_name = "STEPS")]
+    evaluate_every: Option<u64>,
     /// Run directory to write
     #[arg(long)]
     out: PathBuf,
@@ -70,10 +85,35 @@ pub(super) struct Args {
     format: ui::Format,
 }
 
+/// The protocols, as words of the command line.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Evaluate {
+    /// No test: `ccmarl evaluate` afterwards
+    None,
+    /// 100 episodes on each of the eight channels at the end
+    Paper,
+    /// 32 episodes at even intervals, the best team again on 320
+    Standard,
+}
+
+impl From<Evaluate> for Protocol {
+    fn from(word: Evaluate) -> Self {
+        match word {
+            Evaluate::None => Self::None,
+            Evaluate::Paper => Self::Paper,
+            Evaluate::Standard => Self::Standard,
+        }
+    }
+}
+
 impl Args {
     /// The configuration: the file's, then the flags'.
     fn config(&self) -> Result<TrainConfig, Error> {
         let own = self.resume.then(|| self.out.join("config.toml"));
+        if own.as_ref().is_some_and(|own| !own.exists()) {
+            let message = "there is no run to go on with; start it without --resume".to_owned();
+            return Err(TrainError::Resume { message, path: self.out.clone() }.into());
+        }
         let file = self.config.as_deref().or(own.as_deref()).map(TrainConfig::read).transpose()?;
         let spec = self.scenario.spec(file.as_ref().map(|c| c.scenario.clone()))?;
         let spec = spec.unwrap_or_else(|| Spec::new("simple_spread"));
@@ -87,6 +127,12 @@ impl Args {
         }
         config.steps = self.steps.unwrap_or(config.steps);
         config.seed = self.seed.unwrap_or(config.seed);
+        config.envs = self.envs.or(config.envs);
+        if let Some(protocol) = self.evaluate.map(Protocol::from).filter(|p| *p != config.evaluation.protocol) {
+            config.evaluation.protocol = protocol;
+            config.evaluation.episodes = None; // each protocol has its own number
+        }
+        config.evaluation.every = self.evaluate_every.unwrap_or(config.evaluation.every);
         config.dumie.alpha = self.alpha.or(config.dumie.alpha);
         config.dumie.beta = self.beta.or(config.dumie.beta);
         Ok(config)
@@ -96,22 +142,18 @@ impl Args {
 /// Runs the command.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let config = args.config()?;
+    let protocol = config.evaluation.protocol;
     let stop = stop_flag()?;
-    let bar = ui::progress(config.steps, "training");
+    let mut live = ui::Live::new(config.steps, "training");
     let options = Options {
         warm_start: args.warm_start.as_deref(),
         record: args.record.as_deref(),
         resume: args.resume,
         force: args.force,
     };
-    let mut progress = |p: train::Progress| {
-        bar.set_position(p.step);
-        if let Some(mean) = p.return_mean {
-            bar.set_message(format!("return {mean:8.1}"));
-        }
-    };
+    let mut progress = |p: train::Progress| live.at(p.step, p.return_mean);
     let report = train::train(config, &args.out, &options, &mut progress, stop).map_err(Error::from)?;
-    bar.finish_and_clear();
+    live.finish();
     let out = args.out.display().to_string();
     match args.format {
         ui::Format::Json => ui::print_json(&json!({"out": out, "report": report}))?,
@@ -131,6 +173,10 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         ui::say(&format!("interrupted and saved; go on with: ccmarl train --out {out} --resume"));
         return Ok(Outcome::Interrupted);
     }
-    ui::say(&format!("next: ccmarl evaluate {out} --suite paper"));
+    if protocol == Protocol::Paper {
+        ui::say(&format!("next: ccmarl report {out} --out reports/first"));
+    } else {
+        ui::say(&format!("next: ccmarl evaluate {out} --suite paper"));
+    }
     Ok(Outcome::Done)
 }

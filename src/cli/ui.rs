@@ -1,8 +1,8 @@
 //! What all commands share on the terminal: results, tables, progress, errors.
 
-use std::io::Write as _;
+use std::io::{IsTerminal as _, Write as _};
 use std::process::ExitCode;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -77,6 +77,62 @@ pub(super) fn progress(total: u64, what: &'static str) -> ProgressBar {
     bar
 }
 
+/// Seconds between two lines about a long run where stderr is no terminal.
+const LINE_EVERY: Duration = Duration::from_secs(10);
+
+/// How far a long run is: a bar with rate and ETA on a terminal, else a plain line every [`LINE_EVERY`].
+pub(super) struct Live {
+    bar: ProgressBar,
+    total: u64,
+    plain: bool,
+    /// When the last line was said, and at which step.
+    said: Option<(Instant, u64)>,
+}
+
+impl Live {
+    /// For a run of `total` steps.
+    pub(super) fn new(total: u64, what: &'static str) -> Self {
+        Self { bar: progress(total, what), total, plain: !std::io::stderr().is_terminal(), said: None }
+    }
+
+    /// Tells where the run stands.
+    pub(super) fn at(&mut self, step: u64, return_mean: Option<f64>) {
+        let Some((since, from)) = self.said else {
+            // a resumed run starts in the middle: the steps before were not this process's
+            self.bar.set_position(step);
+            self.bar.reset_eta();
+            self.said = Some((Instant::now(), step));
+            return;
+        };
+        self.bar.set_position(step);
+        if let Some(mean) = return_mean {
+            self.bar.set_message(format!("return {mean:8.1}"));
+        }
+        if self.plain && since.elapsed() >= LINE_EVERY {
+            say(&run_line(step, self.total, (step - from) as f64 / since.elapsed().as_secs_f64(), return_mean));
+            self.said = Some((Instant::now(), step));
+        }
+    }
+
+    /// Takes the bar away.
+    pub(super) fn finish(&self) {
+        self.bar.finish_and_clear();
+    }
+}
+
+/// One line about a run: how far, how it does, how fast, how long still.
+fn run_line(step: u64, total: u64, rate: f64, return_mean: Option<f64>) -> String {
+    let share = 100.0 * step as f64 / total.max(1) as f64;
+    let earned = return_mean.map_or(String::new(), |mean| format!(", return {mean:.1}"));
+    let left = total.saturating_sub(step) as f64 / rate;
+    let eta = if left.is_finite() {
+        indicatif::HumanDuration(Duration::from_secs(left as u64)).to_string()
+    } else {
+        "unknown".to_owned()
+    };
+    format!("step {step} of {total} ({share:.0} %){earned}, {rate:.0} steps/s, ETA {eta}")
+}
+
 /// Prints an error once, as one line, and gives its exit code: 2 when the user's words are at fault, else 1.
 pub(super) fn report_error(error: &anyhow::Error) -> ExitCode {
     if error.is::<BrokenPipe>() {
@@ -85,4 +141,16 @@ pub(super) fn report_error(error: &anyhow::Error) -> ExitCode {
     eprintln!("error: {}", crate::io::printable(&format!("{error:#}")));
     let usage = error.chain().any(|e| e.downcast_ref::<crate::Error>().is_some_and(crate::Error::is_usage));
     ExitCode::from(if usage { 2 } else { 1 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_about_a_run_says_how_far_how_well_how_fast_and_how_long_still() {
+        let line = run_line(1_000_000, 4_000_000, 25_000.0, Some(-161.44));
+        assert_eq!(line, "step 1000000 of 4000000 (25 %), return -161.4, 25000 steps/s, ETA 2 minutes");
+        assert_eq!(run_line(25, 100, 0.0, None), "step 25 of 100 (25 %), 0 steps/s, ETA unknown");
+    }
 }

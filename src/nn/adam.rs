@@ -193,7 +193,17 @@ mod tests {
             let before = (adam.clone(), params.clone(), target.clone());
             let Adam { config, m, v, .. } = &mut adam;
             let (params_of, target_of) = (&mut params, &mut target);
-            level.run(Step { config: *config, step: 0.1, root2: 0.5, tau: 0.25, params: params_of, grads: &grads, m, v, target: target_of });
+            level.run(Step {
+                config: *config,
+                step: 0.1,
+                root2: 0.5,
+                tau: 0.25,
+                params: params_of,
+                grads: &grads,
+                m,
+                v,
+                target: target_of,
+            });
             for i in 0..n {
                 let g = f64::from(grads[i]);
                 let [b1, b2] = [0.9f32, 0.999].map(|b| [f64::from(b), f64::from(1.0 - b)]);

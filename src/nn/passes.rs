@@ -82,7 +82,7 @@ impl Mlp {
     }
 
     /// Lays out what the forward pass needs.
-    pub(super) fn pack_forward(&self, params: &[f32], packed: &mut Packed) {
+    pub(crate) fn pack_forward(&self, params: &[f32], packed: &mut Packed) {
         assert!(params.len() >= self.parameters());
         packed.layers.resize_with(self.layers(), Layer::default);
         for at in 0..self.layers() {
@@ -105,7 +105,7 @@ impl Mlp {
     }
 
     /// Lays out what the backward pass needs beside that.
-    pub(super) fn pack_backward(&self, params: &[f32], packed: &mut Packed) {
+    pub(crate) fn pack_backward(&self, params: &[f32], packed: &mut Packed) {
         (0..self.layers()).filter(|&at| !self.few(at)).for_each(|at| self.pack_natural(params, packed, at));
     }
 

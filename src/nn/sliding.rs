@@ -17,7 +17,11 @@ pub(crate) struct Lines<'a> {
 impl Lines<'_> {
     /// Checks that `lines` lines hold columns `offset..offset + n`.
     fn check(self, lines: usize, offset: usize, n: usize) {
-        assert!(offset + n <= self.stride && self.data.len() >= lines * self.stride, "{lines} lines of {}", self.stride);
+        assert!(
+            offset + n <= self.stride && self.data.len() >= lines * self.stride,
+            "{lines} lines of {}",
+            self.stride
+        );
     }
 
     #[inline(always)]

@@ -113,28 +113,111 @@ pub trait Policy: Send + Sync {
 
     /// The policy's state for one episode; `seeds` is the episode's own node of the seed tree.
     fn start<'a>(&'a self, scenario: &'a dyn Scenario, seeds: &Seeds) -> Box<dyn PolicyEpisode + 'a>;
+
+    /// The policy's state for episodes that are played together, number `first` and on, each with its own node. What
+    /// an episode does must not depend on the others; a policy that gains from many rows at once says how.
+    fn start_together<'a>(
+        &'a self,
+        scenario: &'a dyn Scenario,
+        _first: u64,
+        nodes: &[Seeds],
+    ) -> Box<dyn PolicyEpisode + 'a> {
+        Box::new(OneByOne {
+            widths: Widths::of(scenario, self.message_widths(scenario)),
+            episodes: nodes.iter().map(|seeds| self.start(scenario, seeds)).collect(),
+        })
+    }
+
+    /// What every agent sends, element counts.
+    fn message_widths(&self, scenario: &dyn Scenario) -> Vec<usize> {
+        let width =
+            |(i, agent): (usize, &AgentSpec)| if agent.communicator { self.message_width(scenario, i) } else { 0 };
+        scenario.agents().iter().enumerate().map(width).collect()
+    }
 }
 
-/// What a policy sees at one step. Flat buffers concatenate the agents in order.
+/// What a policy sees at one step. Flat buffers concatenate the agents in order, and worlds one after the other.
 #[derive(Clone, Copy, Debug)]
 pub struct View<'a> {
-    /// The world's state before the action.
+    /// The worlds' states before the action.
     pub state: &'a [f64],
-    /// `[Σ observation]`.
+    /// `[Σ observation]` per world.
     pub observations: &'a [f32],
-    /// `[Σ message]`, as sent, before the channel.
+    /// `[Σ message]` per world, as sent, before the channel.
     pub messages: &'a [f32],
-    /// Link bits `[sender][receiver]` over the communicators.
+    /// Link bits `[sender][receiver]` over the communicators, per world.
     pub link: &'a [bool],
 }
 
-/// One episode of a policy: per row `send`, then (but on the last row) `act`.
+/// One episode of a policy, or several together: per row `send`, then (but on the last row) `act`.
 pub trait PolicyEpisode {
     /// Writes the communicators' messages `[Σ message]`; by default each sends its observation.
     fn send(&mut self, observations: &[f32], messages: &mut [f32]);
 
     /// Writes the actions of all agents under policy control into the flat `[Σ action]` buffer.
     fn act(&mut self, view: &View<'_>, actions: &mut [f32]);
+}
+
+/// Elements of one world's part of each flat buffer.
+#[derive(Clone, Copy, Debug)]
+struct Widths {
+    state: usize,
+    observations: usize,
+    messages: usize,
+    link: usize,
+    actions: usize,
+}
+
+impl Widths {
+    fn of(scenario: &dyn Scenario, messages: Vec<usize>) -> Self {
+        let agents = scenario.agents();
+        let communicators = agents.iter().filter(|a| a.communicator).count();
+        Self {
+            state: scenario.shape().width(),
+            observations: agents.iter().map(|a| a.observation).sum(),
+            messages: messages.into_iter().sum(),
+            link: communicators * communicators,
+            actions: agents.iter().map(|a| a.action).sum(),
+        }
+    }
+}
+
+/// World `world`'s part of a flat buffer.
+fn part<T>(buffer: &[T], width: usize, world: usize) -> &[T] {
+    &buffer[world * width..(world + 1) * width]
+}
+
+/// World `world`'s part of a flat buffer, to write.
+fn part_mut<T>(buffer: &mut [T], width: usize, world: usize) -> &mut [T] {
+    &mut buffer[world * width..(world + 1) * width]
+}
+
+/// Episodes that are played together by a policy that acts in one world at a time.
+struct OneByOne<'a> {
+    widths: Widths,
+    episodes: Vec<Box<dyn PolicyEpisode + 'a>>,
+}
+
+impl PolicyEpisode for OneByOne<'_> {
+    fn send(&mut self, observations: &[f32], messages: &mut [f32]) {
+        let w = self.widths;
+        for (world, episode) in self.episodes.iter_mut().enumerate() {
+            episode.send(part(observations, w.observations, world), part_mut(messages, w.messages, world));
+        }
+    }
+
+    fn act(&mut self, view: &View<'_>, actions: &mut [f32]) {
+        let w = self.widths;
+        for (world, episode) in self.episodes.iter_mut().enumerate() {
+            let own = View {
+                state: part(view.state, w.state, world),
+                observations: part(view.observations, w.observations, world),
+                messages: part(view.messages, w.messages, world),
+                link: part(view.link, w.link, world),
+            };
+            episode.act(&own, part_mut(actions, w.actions, world));
+        }
+    }
 }
 
 /// Copies each sender's observation into its message: the default content of messages.

@@ -4,10 +4,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use rayon::iter::{IntoParallelIterator as _, ParallelIterator as _};
 
-use super::{Policy, RecordError, View};
+use super::{Policy, RecordError, View, Widths, part, part_mut};
 use crate::link::Link;
 use crate::rng::Seeds;
-use crate::scenario::{Scenario, Scratch};
+use crate::scenario::{Scenario, Worlds};
 use crate::schema::{Episode, Layout, Manifest};
 use crate::storage::EpisodeSink;
 
@@ -53,6 +53,9 @@ pub struct EpisodeReturn {
     pub loss_rate: f64,
 }
 
+/// Episodes that one thread plays together, at most: a trained team acts faster on many rows.
+const TOGETHER: u64 = 16;
+
 /// Memory that a block may take, bytes; a block holds at least one episode.
 const BLOCK_BYTES: usize = 32 << 20;
 
@@ -60,9 +63,8 @@ impl Recording<'_> {
     /// The shape of its episodes: the scenario's, with the policy's message widths.
     pub fn layout(&self) -> Layout {
         let mut layout = self.scenario.layout();
-        for (i, agent) in layout.agents.iter_mut().enumerate() {
-            agent.message = if agent.communicator { self.policy.message_width(self.scenario, i) } else { 0 };
-        }
+        let widths = self.policy.message_widths(self.scenario);
+        layout.agents.iter_mut().zip(widths).for_each(|(agent, width)| agent.message = width);
         layout
     }
 
@@ -76,53 +78,85 @@ impl Recording<'_> {
 
     /// Episode number `index`: the same for the same seed, whoever asks and in whatever order.
     pub fn episode(&self, index: u64) -> Episode {
-        self.episode_of(&self.layout(), index)
+        self.together(&self.layout(), index, 1).pop().unwrap_or_default()
     }
 
-    fn episode_of(&self, layout: &Layout, index: u64) -> Episode {
+    /// The episodes from number `first` on, `count` of them, all worlds moved together: the same episodes as one by one,
+    /// to the bit. `layout` is this recording's.
+    pub fn together(&self, layout: &Layout, first: u64, count: usize) -> Vec<Episode> {
         let (scenario, agents, steps) = (self.scenario, &layout.agents, self.scenario.steps());
-        let seeds = Seeds::new(self.seed).child("record").indexed("episode", index);
-        let total = |width: fn(&crate::schema::AgentSpec) -> usize| agents.iter().map(width).sum();
-        let mut observations = vec![0.0; total(|a| a.observation)];
-        let mut messages = vec![0.0; total(|a| a.message)];
-        let mut actions = vec![0.0; total(|a| a.action)];
-        let mut rewards = vec![0.0; agents.len()];
+        let root = Seeds::new(self.seed).child("record");
+        let nodes: Vec<Seeds> = (0..count as u64).map(|i| root.indexed("episode", first + i)).collect();
+        let children = |name: &str| nodes.iter().map(|node| node.child(name)).collect::<Vec<_>>();
+        let w = Widths::of(scenario, agents.iter().map(|a| a.message).collect());
         let communicators = layout.communicators();
-        let mut link = vec![true; communicators.len() * communicators.len()];
+        let mut observations = vec![0.0; count * w.observations];
+        let mut messages = vec![0.0; count * w.messages];
+        let mut actions = vec![0.0; count * w.actions];
+        let (mut rewards, mut team) = (vec![0.0; count * agents.len()], vec![0.0; count]);
+        let mut link = vec![true; count * w.link];
         let mut bodies = vec![[0.0; 4]; communicators.len()];
 
-        let (mut state, mut scratch) = (vec![0.0; scenario.shape().width()], Scratch::default());
-        scenario.reset(&mut state, &mut seeds.stream("world"));
-        let mut rule = seeds.stream("scripted");
-        let mut links = self.link.start(communicators.len(), index, &seeds.child("link"));
-        let mut policy = self.policy.start(scenario, &seeds.child("policy"));
-        let mut episode = Episode::with_capacity(layout, index, steps);
+        let mut worlds = Worlds::new(scenario, count);
+        nodes.iter().enumerate().for_each(|(i, node)| worlds.reset(i, &mut node.stream("world")));
+        let mut rules: Vec<_> = nodes.iter().map(|node| node.stream("scripted")).collect();
+        let start = |(node, index): (&Seeds, u64)| self.link.start(communicators.len(), index, node);
+        let mut links: Vec<_> = children("link").iter().zip(first..).map(start).collect();
+        let mut policy = self.policy.start_together(scenario, first, &children("policy"));
+        let start = |i: u64| Episode::with_capacity(layout, first + i, steps);
+        let mut episodes: Vec<Episode> = (0..count as u64).map(start).collect();
         for t in 0..=steps {
-            scenario.observe(&state, &mut observations);
+            worlds.observe(&mut observations);
             policy.send(&observations, &mut messages);
-            let world = scenario.shape().world(&state);
-            for (body, &agent) in bodies.iter_mut().zip(&communicators) {
-                let ([x, y], [vx, vy]) = (world.position(agent), world.velocity(agent));
-                *body = [x, y, vx, vy];
+            for (i, episode) in episodes.iter_mut().enumerate() {
+                let (state, bits) = (worlds.state(i), part_mut(&mut link, w.link, i));
+                let world = scenario.shape().world(state);
+                for (body, &agent) in bodies.iter_mut().zip(&communicators) {
+                    let ([x, y], [vx, vy]) = (world.position(agent), world.velocity(agent));
+                    *body = [x, y, vx, vy];
+                }
+                links[i].emit(&bodies, bits);
+                episode.state.extend_from_slice(state);
+                append(&mut episode.observations, part(&observations, w.observations, i));
+                append(&mut episode.messages, part(&messages, w.messages, i));
+                episode.link.extend_from_slice(bits);
             }
-            links.emit(&bodies, &mut link);
-            episode.state.extend_from_slice(&state);
-            append(&mut episode.observations, &observations);
-            append(&mut episode.messages, &messages);
-            episode.link.extend_from_slice(&link);
             if t == steps {
                 break; // the last row has no action
             }
-            let view = View { state: &state, observations: &observations, messages: &messages, link: &link };
+            let view = View { state: worlds.states(), observations: &observations, messages: &messages, link: &link };
             policy.act(&view, &mut actions);
-            scenario.scripted(&state, &mut rule, &mut actions);
-            scenario.step(&mut state, &actions, &mut rewards, &mut scratch);
-            append(&mut episode.actions, &actions);
-            episode.reward.push(scenario.team_reward(&rewards));
-            episode.rewards.iter_mut().zip(&rewards).for_each(|(column, &r)| column.push(r));
+            worlds.scripted(&mut rules, &mut actions);
+            worlds.step(&actions, &mut rewards, &mut team);
+            for (i, episode) in episodes.iter_mut().enumerate() {
+                append(&mut episode.actions, part(&actions, w.actions, i));
+                episode.reward.push(team[i]);
+                let own = part(&rewards, agents.len(), i);
+                episode.rewards.iter_mut().zip(own).for_each(|(column, &r)| column.push(r));
+            }
         }
-        episode.steps = steps;
-        episode
+        for episode in &mut episodes {
+            episode.steps = steps;
+        }
+        episodes
+    }
+
+    /// What `figure` makes of the groups of episodes that `first..end` is played in, in order, on all threads of the
+    /// caller's pool.
+    fn in_groups<T: Send>(
+        &self,
+        layout: &Layout,
+        [first, end]: [u64; 2],
+        figure: impl Fn(Vec<Episode>) -> Vec<T> + Sync,
+    ) -> Vec<T> {
+        let count = end.saturating_sub(first);
+        let share = count.div_ceil(rayon::current_num_threads() as u64);
+        let size = share.min(TOGETHER).min(default_block(layout, self.scenario.steps()) as u64).max(1);
+        let play = |group: u64| {
+            let from = first + group * size;
+            figure(self.together(layout, from, size.min(end - from) as usize))
+        };
+        (0..count.div_ceil(size)).into_par_iter().flat_map_iter(play).collect()
     }
 
     /// Computes all episodes in blocks, in parallel, and appends them in order, while the next block is computed, from
@@ -152,7 +186,7 @@ impl Recording<'_> {
         let size = if options.block == 0 { default_block(&layout, self.scenario.steps()) } else { options.block };
         let compute = |first: u64| -> Vec<Episode> {
             let end = if stop.load(Ordering::Relaxed) { first } else { first.saturating_add(size as u64) };
-            (first..end.min(self.episodes)).into_par_iter().map(|i| self.episode_of(&layout, i)).collect()
+            self.in_groups(&layout, [first, end.min(self.episodes)], |episodes| episodes)
         };
         let mut done = 0;
         let mut block = pool.install(|| compute(0));
@@ -198,9 +232,7 @@ pub fn loss_rate(episode: &Episode, n: usize) -> f64 {
 pub fn returns(recording: &Recording<'_>, first: u64, count: u64) -> Vec<EpisodeReturn> {
     let layout = recording.layout();
     let n = layout.communicators().len();
-    let one = |index| {
-        let episode = recording.episode_of(&layout, index);
-        EpisodeReturn { episode_return: episode.episode_return(), loss_rate: loss_rate(&episode, n) }
-    };
-    (first..first.saturating_add(count)).into_par_iter().map(one).collect()
+    let figure = |e: &Episode| EpisodeReturn { episode_return: e.episode_return(), loss_rate: loss_rate(e, n) };
+    let end = first.saturating_add(count);
+    recording.in_groups(&layout, [first, end], |episodes| episodes.iter().map(figure).collect())
 }

@@ -9,10 +9,11 @@
 //! One action row per learner, in \[low, 1\]; the message is the sender's observation.
 //!
 //! # Parameters
-//! `path` (the run directory), `action_noise` (σ, default 0).
+//! `path` (the run directory, or an actor file), `action_noise` (σ, default 0).
 //!
 //! # When it fails
-//! The directory holds no actors, or they were trained for other agents.
+//! The directory holds no actors, or they were trained in another world: every constant of the scenario must be the
+//! same, and each that is not is named.
 //!
 //! # Reference
 //! Paper, appendix "Parameters Setting"; the noise process is that of the paper's parent code.
@@ -25,13 +26,11 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
-use super::{Build, Policy, PolicyEpisode, View};
-use crate::algo::Actors;
-use crate::io::IoError;
-use crate::nn::Tape;
-use crate::registry::{Entry, RegistryError};
+use super::{Build, Policy, PolicyEpisode, View, Widths, part, part_mut};
+use crate::algo::{Actors, RunPolicyError, Team, TeamScratch};
+use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::{self, Seeds, Stream};
-use crate::scenario::{Scenario, offsets};
+use crate::scenario::{self, Scenario, offsets};
 use crate::schema::AgentSpec;
 
 /// The policy's line in the registry.
@@ -53,32 +52,22 @@ pub(super) const ENTRY: Entry<Build> = Entry {
         if !(0.0..=10.0).contains(&params.action_noise) {
             return Err(spec.invalid(format!("action_noise: expected 0 to 10, found {}", params.action_noise)));
         }
-        let (actors, values) = Actors::load(&params.path).map_err(|e| RegistryError::Data(e.to_string()))?;
-        let low = scenario.space().decoder.low();
-        actors.check_fit(&learners(scenario), low, &params.path).map_err(|e| RegistryError::Data(e.to_string()))?;
         let noise =
             if params.action_noise > 0.0 { ActionNoise::Gaussian(params.action_noise) } else { ActionNoise::None };
-        let parameters =
-            described(&params.path, params.action_noise).map_err(|e| RegistryError::Data(e.to_string()))?;
-        Ok(Box::new(Trained { actors, params: values, noise, parameters }))
+        Ok(Box::new(Trained::load(&params.path, scenario, noise)?))
     },
 };
 
 /// What the manifest records: the run's own name and the digest of its actors, so that equal runs at different places
 /// give equal stores.
-fn described(path: &Path, action_noise: f64) -> Result<Map<String, Value>, IoError> {
-    let (sha256, _) = crate::io::sha256_file(&Actors::file(path))?;
+fn described(path: &Path, actors: &Actors, action_noise: f64) -> Map<String, Value> {
     let run = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
     let fields = [
         ("run", Value::from(run)),
-        ("actors_sha256", Value::from(sha256)),
+        ("actors_sha256", Value::from(actors.file_sha256.clone())),
         ("action_noise", Value::from(action_noise)),
     ];
-    Ok(super::resolved(ENTRY.name, &fields))
-}
-
-fn learners(scenario: &dyn Scenario) -> Vec<&AgentSpec> {
-    scenario.agents().iter().filter(|a| a.learner).collect()
+    super::resolved(ENTRY.name, &fields)
 }
 
 /// Exploration noise on actions.
@@ -88,28 +77,87 @@ pub enum ActionNoise {
     None,
     /// Independent normal draws with this standard deviation.
     Gaussian(f64),
-    /// x ← x − theta x + sigma z per step, reset each episode, times `scale`.
+    /// x ← x − theta x + sigma z per step, from zero in each episode, times a factor that falls linearly from `scale` in
+    /// episode 0 to zero in episode number `episodes`.
     OrnsteinUhlenbeck {
         /// Pull towards zero.
         theta: f64,
         /// Standard deviation of a step.
         sigma: f64,
-        /// Factor on the process.
+        /// Factor on the process in episode 0.
         scale: f64,
+        /// Episodes until there is none.
+        episodes: u64,
     },
 }
 
-/// A team of actors with their parameters.
+impl ActionNoise {
+    /// The factor on the process in episode number `episode`; 1 for noise that does not fall, 0 for none.
+    pub fn scale(&self, episode: u64) -> f64 {
+        match *self {
+            Self::None | Self::OrnsteinUhlenbeck { episodes: 0, .. } => 0.0,
+            Self::Gaussian(_) => 1.0,
+            Self::OrnsteinUhlenbeck { scale, episodes, .. } => {
+                scale * episodes.saturating_sub(episode) as f64 / episodes as f64
+            }
+        }
+    }
+}
+
+/// A team of actors, laid out for acting on the rows of many worlds at once.
 #[derive(Clone, Debug)]
 pub struct Trained {
     /// Shapes.
     pub actors: Actors,
-    /// All actors' parameters, flat.
-    pub params: Vec<f32>,
     /// Exploration.
     pub noise: ActionNoise,
-    /// What the manifest records.
-    pub parameters: Map<String, Value>,
+    team: Team,
+    parameters: Map<String, Value>,
+}
+
+impl Trained {
+    /// A team with these parameters of all its networks; `parameters` is what a manifest records.
+    pub fn new(actors: Actors, params: &[f32], noise: ActionNoise, parameters: Map<String, Value>) -> Self {
+        let mut team = Team::default();
+        team.load_forward(&actors, params);
+        Self { actors, noise, team, parameters }
+    }
+
+    /// The team of a run directory (or an actor file), which must fit `scenario`.
+    ///
+    /// # Errors
+    /// [`RegistryError::Data`] when it cannot be read or does not fit.
+    pub fn load(path: &Path, scenario: &dyn Scenario, noise: ActionNoise) -> Result<Self, RegistryError> {
+        let data = |e: RunPolicyError| RegistryError::Data(e.to_string());
+        let (actors, values) = Actors::load(path).map_err(data)?;
+        let sigma = if let ActionNoise::Gaussian(sigma) = noise { sigma } else { 0.0 };
+        let parameters = described(path, &actors, sigma);
+        let team = Self::new(actors, &values, noise, parameters);
+        team.check_fit(scenario, path).map_err(data)?;
+        Ok(team)
+    }
+
+    /// Takes over changed parameters.
+    pub fn set(&mut self, params: &[f32]) {
+        self.team.load_forward(&self.actors, params);
+    }
+
+    /// Checks that the team can act in `scenario`, and was trained in the same world where it knows which.
+    ///
+    /// # Errors
+    /// [`RunPolicyError::DoesNotFit`] that names what differs; `path` is where the team came from.
+    pub fn check_fit(&self, scenario: &dyn Scenario, path: &Path) -> Result<(), RunPolicyError> {
+        if let Some(Value::String(name)) = self.actors.scenario.get("name") {
+            let mut given = self.actors.scenario.clone();
+            given.retain(|key, value| key != "name" && !value.is_null());
+            // a constant that the program got since then has its default
+            let trained = scenario::build(&Spec { name: name.clone(), params: given }).map(|s| s.parameters());
+            let trained = trained.unwrap_or_else(|_| self.actors.scenario.clone());
+            Actors::check_world(&trained, &scenario.parameters(), path)?;
+        }
+        let learners: Vec<&AgentSpec> = scenario.agents().iter().filter(|a| a.learner).collect();
+        self.actors.check_fit(&learners, scenario.space().decoder.low(), path)
+    }
 }
 
 impl Policy for Trained {
@@ -118,64 +166,103 @@ impl Policy for Trained {
     }
 
     fn start<'a>(&'a self, scenario: &'a dyn Scenario, seeds: &Seeds) -> Box<dyn PolicyEpisode + 'a> {
+        self.start_together(scenario, 0, std::slice::from_ref(seeds))
+    }
+
+    fn start_together<'a>(
+        &'a self,
+        scenario: &'a dyn Scenario,
+        first: u64,
+        nodes: &[Seeds],
+    ) -> Box<dyn PolicyEpisode + 'a> {
         let agents = scenario.agents();
-        let observation_offsets = offsets(agents, |a| a.observation);
-        let action_offsets = offsets(agents, |a| a.action);
-        let learners: Vec<usize> = (0..agents.len()).filter(|&a| agents[a].learner).collect();
+        let learners = |width: fn(&AgentSpec) -> usize| -> Vec<[usize; 2]> {
+            let ends = offsets(agents, width);
+            (0..agents.len()).filter(|&a| agents[a].learner).map(|a| [ends[a], ends[a + 1]]).collect()
+        };
+        let action = learners(|a| a.action);
+        let components: usize = action.iter().map(|[from, to]| to - from).sum();
         Box::new(Acting {
-            team: self,
-            noise: seeds.stream("action-noise"),
-            process: vec![0.0; learners.iter().map(|&a| agents[a].action).sum()],
-            observation: learners.iter().map(|&a| [observation_offsets[a], observation_offsets[a + 1]]).collect(),
-            action: learners.iter().map(|&a| [action_offsets[a], action_offsets[a + 1]]).collect(),
+            trained: self,
+            widths: Widths::of(scenario, self.message_widths(scenario)),
+            noise: nodes.iter().map(|seeds| seeds.stream("action-noise")).collect(),
+            scale: (0..nodes.len() as u64).map(|i| self.noise.scale(first + i)).collect(),
+            process: vec![0.0; nodes.len() * components],
+            observation: learners(|a| a.observation),
+            action,
             scenario,
-            row: Vec::new(),
-            input: Vec::new(),
-            tape: Tape::default(),
+            rows: Vec::new(),
+            scratch: TeamScratch::default(),
         })
     }
 }
 
+/// A team in as many worlds as there are streams of noise.
 struct Acting<'a> {
-    team: &'a Trained,
+    trained: &'a Trained,
     scenario: &'a dyn Scenario,
-    noise: Stream,
+    widths: Widths,
+    noise: Vec<Stream>,
+    /// Factor on the noise, per world.
+    scale: Vec<f64>,
+    /// State of the noise `[worlds, components]`.
     process: Vec<f64>,
+    /// Where each learner's observation and action lie in a world's row.
     observation: Vec<[usize; 2]>,
     action: Vec<[usize; 2]>,
-    row: Vec<f32>,
-    input: Vec<f32>,
-    tape: Tape,
+    /// Observations of all learners `[worlds, O]`.
+    rows: Vec<f32>,
+    scratch: TeamScratch,
 }
 
 impl PolicyEpisode for Acting<'_> {
     fn send(&mut self, observations: &[f32], messages: &mut [f32]) {
-        super::send_observations(self.scenario.agents(), observations, messages);
+        let w = self.widths;
+        for world in 0..self.noise.len() {
+            let (seen, sent) = (part(observations, w.observations, world), part_mut(messages, w.messages, world));
+            super::send_observations(self.scenario.agents(), seen, sent);
+        }
     }
 
     fn act(&mut self, view: &View<'_>, actions: &mut [f32]) {
-        self.row.clear();
-        for &[from, to] in &self.observation {
-            self.row.extend_from_slice(&view.observations[from..to]);
+        let (worlds, w) = (self.noise.len(), self.widths);
+        self.rows.clear();
+        for world in 0..worlds {
+            let seen = part(view.observations, w.observations, world);
+            self.observation.iter().for_each(|&[from, to]| self.rows.extend_from_slice(&seen[from..to]));
         }
-        let mut component = 0;
+        self.trained.team.act(&self.trained.actors, &self.rows, view.link, worlds, &mut self.scratch);
         for (i, &[from, to]) in self.action.iter().enumerate() {
-            self.input.clear();
-            self.team.actors.push_input(i, &self.row, view.link, &mut self.input);
-            let action = self.team.actors.act(&self.team.params, i, &self.input, 1, &mut self.tape);
-            actions[from..to].copy_from_slice(action);
-            for action in &mut actions[from..to] {
-                let noise = match self.team.noise {
-                    ActionNoise::Gaussian(sigma) => sigma * rng::normal(&mut self.noise),
-                    ActionNoise::None | ActionNoise::OrnsteinUhlenbeck { scale: 0.0, .. } => continue,
-                    ActionNoise::OrnsteinUhlenbeck { theta, sigma, scale } => {
-                        let x = &mut self.process[component];
-                        *x += sigma * rng::normal(&mut self.noise) - theta * *x;
-                        component += 1;
+            let chosen = self.scratch.actions(i);
+            for (world, action) in chosen.chunks_exact(to - from).enumerate() {
+                part_mut(actions, w.actions, world)[from..to].copy_from_slice(action);
+            }
+        }
+        for world in 0..worlds {
+            if self.scale[world] != 0.0 {
+                self.explore(world, part_mut(actions, w.actions, world));
+            }
+        }
+    }
+}
+
+impl Acting<'_> {
+    /// Adds noise to the actions of one world, learner by learner, component by component.
+    fn explore(&mut self, world: usize, actions: &mut [f32]) {
+        let components = self.process.len() / self.noise.len();
+        let (rng, scale) = (&mut self.noise[world], self.scale[world]);
+        let mut process = part_mut(&mut self.process, components, world).iter_mut();
+        for &[from, to] in &self.action {
+            for (action, x) in actions[from..to].iter_mut().zip(&mut process) {
+                let noise = match self.trained.noise {
+                    ActionNoise::None => continue,
+                    ActionNoise::Gaussian(sigma) => sigma * rng::normal(rng),
+                    ActionNoise::OrnsteinUhlenbeck { theta, sigma, .. } => {
+                        *x += sigma * rng::normal(rng) - theta * *x;
                         scale * *x
                     }
                 };
-                *action = (*action + noise as f32).clamp(self.team.actors.low(), 1.0);
+                *action = (*action + noise as f32).clamp(self.trained.actors.low(), 1.0);
             }
         }
     }

@@ -15,8 +15,23 @@ use crate::report::mutual::{self, MutualFile};
 const DEPTH: usize = 3;
 
 /// Configuration keys that do not make two trainings different: where they go, and the seed.
-const NOT_SETTINGS: [&str; 11] =
-    ["ccmarl", "seed", "log_every", "out", "force", "resume", "record", "threads", "name", "title", "warm_start"];
+const NOT_SETTINGS: [&str; 15] = [
+    "ccmarl",
+    "seed",
+    "log_every",
+    "checkpoint_every",
+    "evaluation.protocol",
+    "evaluation.every",
+    "evaluation.episodes",
+    "out",
+    "force",
+    "resume",
+    "record",
+    "threads",
+    "name",
+    "title",
+    "warm_start",
+];
 
 /// What runs must share to stand in one table: returns of different tasks are not comparable.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -237,8 +252,7 @@ fn read_run(path: &Path) -> Result<Run, ReportError> {
     };
     let config: Config = toml::from_str(&text).map_err(|e| broken(e.message().to_owned()))?;
     let raw: toml::Table = toml::from_str(&text).map_err(|e| broken(e.message().to_owned()))?;
-    let mut settings = BTreeMap::new();
-    flatten("", &toml::Value::Table(raw), &mut settings);
+    let mut settings = crate::registry::dotted(&toml::Value::Table(raw));
     settings.retain(|key, _| !NOT_SETTINGS.contains(&key.as_str()));
     let profile = config.scenario.params.get("profile").and_then(|v| v.as_str()).unwrap_or("paper").to_owned();
     let agents = config.scenario.params.get("agents").and_then(serde_json::Value::as_i64);
@@ -267,17 +281,6 @@ fn read_run(path: &Path) -> Result<Run, ReportError> {
         guarded(&evaluation, || read_evaluation(&evaluation, &mut run))?;
     }
     Ok(run)
-}
-
-fn flatten(prefix: &str, value: &toml::Value, out: &mut BTreeMap<String, String>) {
-    if let toml::Value::Table(table) = value {
-        for (key, value) in table {
-            let name = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
-            flatten(&name, value, out);
-        }
-    } else {
-        out.insert(prefix.to_owned(), value.to_string());
-    }
 }
 
 fn read_training(path: &Path, run: &mut Run) -> Result<(), ReportError> {
@@ -330,8 +333,7 @@ mod tests {
 
     #[test]
     fn settings_are_flat_and_leave_out_seed_and_places() {
-        let mut flat = BTreeMap::new();
-        flatten("", &toml::Value::Table(toml::from_str("a = 1\n[dumie]\nalpha = 0.5").unwrap()), &mut flat);
+        let flat = crate::registry::dotted(&toml::from_str("a = 1\n[dumie]\nalpha = 0.5").unwrap());
         assert_eq!(
             flat.into_iter().collect::<Vec<_>>(),
             [("a".into(), "1".into()), ("dumie.alpha".into(), "0.5".into())]

@@ -52,6 +52,11 @@ impl<'a> Worlds<'a> {
         &self.state[i * self.width..(i + 1) * self.width]
     }
 
+    /// The states of all worlds, one after the other.
+    pub fn states(&self) -> &[f64] {
+        &self.state
+    }
+
     /// Starts a new episode in world `i`.
     pub fn reset(&mut self, i: usize, rng: &mut Stream) {
         self.scenario.reset(&mut self.state[i * self.width..(i + 1) * self.width], rng);

@@ -5,8 +5,10 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::TrainError;
+use super::protocol::EvaluationConfig;
 use crate::algo::{self, MaddpgConfig};
-use crate::registry::Spec;
+use crate::registry::{RegistryError, Spec};
+use crate::scenario::Scenario;
 
 /// Largest configuration file that is read, bytes.
 const LIMIT: u64 = 1 << 20;
@@ -35,9 +37,16 @@ pub struct TrainConfig {
     /// One update per this many environment steps.
     #[serde(default = "hundred")]
     pub update_every: u64,
+    /// Worlds stepped together, whole episodes each; as many episodes as lie between two updates when absent, which is
+    /// the paper's order (one world) to the bit. Beyond that the updates of a wave come when it has ended.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub envs: Option<usize>,
     /// One row of metrics per this many updates.
     #[serde(default = "hundred")]
     pub log_every: u64,
+    /// Updates between two checkpoints; changes nothing in the result.
+    #[serde(default = "two_thousand")]
+    pub checkpoint_every: u64,
     /// The scenario and its parameters.
     pub scenario: Spec,
     /// Link prior in training; the preset's when absent.
@@ -52,6 +61,9 @@ pub struct TrainConfig {
     /// The dual mutual-information estimator; α and β of the preset and scenario when absent.
     #[serde(default)]
     pub dumie: DumieConfig,
+    /// Tests that belong to the run.
+    #[serde(default)]
+    pub evaluation: EvaluationConfig,
 }
 
 fn one() -> u64 {
@@ -59,6 +71,9 @@ fn one() -> u64 {
 }
 fn hundred() -> u64 {
     100
+}
+fn two_thousand() -> u64 {
+    2000
 }
 fn first_update() -> u64 {
     1024
@@ -234,50 +249,89 @@ impl TrainConfig {
             replay: hundred_thousand(),
             warmup: first_update(),
             update_every: hundred(),
+            envs: None,
             log_every: hundred(),
+            checkpoint_every: two_thousand(),
             scenario,
             prior: None,
             maddpg: MaddpgConfig::default(),
             noise: NoiseConfig::default(),
             dumie: DumieConfig::default(),
+            evaluation: EvaluationConfig::default(),
         }
     }
 
-    /// Reads a TOML file; a typo is refused with its line.
+    /// Reads a TOML file; a typo is refused with its line, in the tables of plugins too.
     ///
     /// # Errors
     /// [`TrainError::Io`], [`TrainError::Config`].
     pub fn read(path: &Path) -> Result<Self, TrainError> {
         let text = crate::io::read_text(path, LIMIT)?;
-        toml::from_str(&text).map_err(|e| TrainError::Config {
-            message: e.to_string().trim().replace('\n', "; "),
-            path: path.to_owned(),
-        })
+        let refuse = |message: String| TrainError::Config { message, path: path.to_owned() };
+        let config: Self = toml::from_str(&text).map_err(|e| refuse(e.to_string().trim().replace('\n', "; ")))?;
+        // a plugin's parameters are its own: what it refuses has no place in the file until it is looked for
+        config.check_plugins().map_err(|error| match line_of(&text, &error.to_string()) {
+            Some(line) => refuse(format!("line {line}: {error}")),
+            None => refuse(error.to_string()),
+        })?;
+        Ok(config)
+    }
+
+    fn check_plugins(&self) -> Result<(), RegistryError> {
+        let scenario = crate::scenario::build(&self.scenario)?;
+        self.prior.as_ref().map_or(Ok(()), |prior| crate::record::build_link(prior, scenario.as_ref()).map(|_| ()))
     }
 
     /// Fills in what preset and scenario decide, and checks every range.
     ///
     /// # Errors
     /// [`TrainError::Registry`] for unknown names, [`TrainError::Value`] for a value out of its range.
-    pub fn resolve(mut self) -> Result<Self, TrainError> {
+    pub fn resolve(self) -> Result<Self, TrainError> {
+        let scenario = crate::scenario::build(&self.scenario)?;
+        self.resolve_for(scenario.as_ref())
+    }
+
+    /// The same for a scenario that need not be registered.
+    ///
+    /// # Errors
+    /// As [`TrainConfig::resolve`].
+    pub fn resolve_for(mut self, scenario: &dyn Scenario) -> Result<Self, TrainError> {
         let preset = algo::preset(&self.algorithm)?;
         env!("CARGO_PKG_VERSION").clone_into(&mut self.ccmarl);
-        let scenario = crate::scenario::build(&self.scenario)?;
         self.scenario = resolved(scenario.parameters());
         if scenario.space().discrete {
             let message = "this learner's actions are continuous: set it to false".to_owned();
             return Err(TrainError::Value { name: "scenario.discrete".to_owned(), message });
         }
         let prior = self.prior.take().unwrap_or(preset.prior);
-        self.prior = Some(resolved(crate::record::build_link(&prior, scenario.as_ref())?.parameters()));
+        self.prior = Some(resolved(crate::record::build_link(&prior, scenario)?.parameters()));
         let tag = self.scenario.name == "simple_tag";
         let [alpha, beta] = if preset.shaped { [0.01, if tag { 0.001 } else { 0.01 }] } else { [0.0, 0.0] };
         let learners = scenario.agents().iter().filter(|a| a.learner).count();
         self.maddpg.batch.get_or_insert(if tag && learners >= 6 { 512 } else { MaddpgConfig::BATCH });
         self.dumie.alpha.get_or_insert(alpha);
         self.dumie.beta.get_or_insert(beta);
+        for (name, weight) in ["dumie.alpha", "dumie.beta"].into_iter().zip(self.weights()) {
+            if !preset.shaped && weight > 0.0 {
+                let prior = self.prior.as_ref().map(ToString::to_string).unwrap_or_default();
+                let message = format!(
+                    "{} is not shaped, found {weight}: take cc-maddpg with --prior {prior}, so that no table calls a \
+                     shaped run {0}",
+                    self.algorithm
+                );
+                return Err(TrainError::Value { name: name.to_owned(), message });
+            }
+        }
+        let between = self.update_every / (scenario.steps() as u64).max(1);
+        self.envs.get_or_insert(between.clamp(1, 64) as usize);
+        self.evaluation.episodes = Some(self.evaluation.episodes());
         self.check()?;
         Ok(self)
+    }
+
+    /// Worlds stepped together; 1 before [`TrainConfig::resolve`] where not given.
+    pub fn envs(&self) -> usize {
+        self.envs.unwrap_or(1)
     }
 
     /// α and β; zero before [`TrainConfig::resolve`] where not given.
@@ -304,6 +358,10 @@ impl TrainConfig {
             positive("replay", self.replay),
             positive("update_every", self.update_every as usize),
             positive("log_every", self.log_every as usize),
+            positive("checkpoint_every", self.checkpoint_every as usize),
+            ("envs", (1..=4096).contains(&self.envs()), format!("expected 1 to 4096, found {}", self.envs())),
+            positive("evaluation.every", self.evaluation.every as usize),
+            positive("evaluation.episodes", self.evaluation.episodes() as usize),
             positive("maddpg.batch", m.batch.unwrap_or(0)),
             positive("maddpg.hidden", m.hidden.iter().copied().min().unwrap_or(0)),
             unit("maddpg.gamma", m.gamma),
@@ -341,6 +399,25 @@ impl TrainConfig {
     pub fn to_toml(&self) -> Result<String, TrainError> {
         toml::to_string(self).map_err(|e| TrainError::Value { name: "config".to_owned(), message: e.to_string() })
     }
+}
+
+/// The first line of `text` that gives a value to a name which `error` quotes: a key or a plugin.
+fn line_of(text: &str, error: &str) -> Option<usize> {
+    let quoted: Vec<&str> = error.split(['`', '"']).skip(1).step_by(2).collect();
+    // "simple_spread: agents: …" quotes nothing: the words before colons are names too
+    let words = error.split(": ").map(|word| word.split(' ').next().unwrap_or(word));
+    let names = quoted.into_iter().chain(words);
+    let gives = |line: &str, name: &str| {
+        let code = line.split('#').next().unwrap_or(line);
+        code.match_indices(name).any(|(at, _)| {
+            let whole = |c: Option<char>| c.is_none_or(|c| !c.is_alphanumeric() && c != '_' && c != '-');
+            whole(code[..at].chars().next_back()) && whole(code[at + name.len()..].chars().next())
+        })
+    };
+    names
+        .filter(|name| !name.is_empty())
+        .find_map(|name| text.lines().position(|line| gives(line, name)))
+        .map(|line| line + 1)
 }
 
 /// A plugin's resolved parameters, which carry its name, as a spec.

@@ -1,4 +1,4 @@
-//! Evaluation: a trained team on every channel of a suite, without exploration noise.
+//! Evaluation: a team on every channel of a suite, without exploration noise; and the table of what it earned.
 
 use std::path::Path;
 
@@ -7,10 +7,9 @@ use polars::prelude::Column;
 use super::config::TrainConfig;
 use super::{TrainError, metrics};
 use crate::link;
-use crate::record::{self, Recording, returns};
-use crate::registry::Spec;
+use crate::record::{self, Policy, Recording, returns};
 use crate::rng::Seeds;
-use crate::scenario;
+use crate::scenario::Scenario;
 
 /// Columns of `evaluation.parquet`, one row per test episode.
 pub const EVALUATION_COLUMNS: [&str; 9] =
@@ -29,31 +28,32 @@ pub struct EvaluationRow {
     pub loss_rate: f64,
 }
 
-/// Plays `episodes` episodes per channel with the policy `policy` in the scenario of `config`; all policies of one
-/// seed meet the same episodes. `progress` is told of each finished channel.
+/// The seed of a run's test episodes: a tree of its own, so that tests disturb no training. All policies of one seed
+/// meet the same episodes.
+pub fn evaluation_seed(config: &TrainConfig) -> u64 {
+    Seeds::new(config.seed).child("evaluate").seed()
+}
+
+/// Plays `episodes` episodes per channel, those of `seed`. `progress` is told of each finished channel.
 ///
 /// # Errors
-/// [`TrainError::Registry`] when policy, scenario or a channel cannot be built, [`TrainError::Record`] when a channel's
-/// trace is too short.
+/// [`TrainError::Registry`] when a channel cannot be built, [`TrainError::Record`] when its trace is too short.
 pub fn evaluate(
-    config: &TrainConfig,
-    policy: &Spec,
+    scenario: &dyn Scenario,
+    policy: &dyn Policy,
     channels: &[link::Channel],
     episodes: u64,
+    seed: u64,
     progress: &mut dyn FnMut(&str),
 ) -> Result<Vec<EvaluationRow>, TrainError> {
-    let scenario = scenario::build(&config.scenario)?;
-    let policy = record::build_policy(policy, scenario.as_ref())?;
-    let seed = Seeds::new(config.seed).child("evaluate").seed();
     let mut rows = Vec::new();
     for channel in channels {
-        let link = record::build_link(&channel.spec, scenario.as_ref())?;
+        let link = record::build_link(&channel.spec, scenario)?;
         record::check_link(link.as_ref(), episodes)?;
-        let recording =
-            Recording { scenario: scenario.as_ref(), link: link.as_ref(), policy: policy.as_ref(), seed, episodes };
-        rows.extend(returns(&recording, 0, episodes).into_iter().enumerate().map(|(i, r)| EvaluationRow {
+        let recording = Recording { scenario, link: link.as_ref(), policy, seed, episodes };
+        rows.extend(returns(&recording, 0, episodes).into_iter().zip(0..).map(|(r, episode)| EvaluationRow {
             channel: channel.id.to_owned(),
-            episode: i as u64,
+            episode,
             episode_return: r.episode_return,
             loss_rate: r.loss_rate,
         }));
@@ -62,18 +62,27 @@ pub fn evaluate(
     Ok(rows)
 }
 
-/// Writes `evaluation.parquet` into the run directory.
+/// Writes `evaluation.parquet` into the run directory; `learners` is how many agents learned.
 ///
 /// # Errors
 /// [`TrainError`].
-pub fn write_evaluation(dir: &Path, config: &TrainConfig, rows: &[EvaluationRow]) -> Result<(), TrainError> {
+pub fn write_evaluation(
+    dir: &Path,
+    config: &TrainConfig,
+    learners: usize,
+    rows: &[EvaluationRow],
+) -> Result<(), TrainError> {
+    metrics::write_parquet(&dir.join("evaluation.parquet"), columns(config, learners, rows))
+}
+
+/// [`EVALUATION_COLUMNS`] of these rows.
+pub(super) fn columns(config: &TrainConfig, learners: usize, rows: &[EvaluationRow]) -> Vec<Column> {
     let n = rows.len();
-    let agents = scenario::build(&config.scenario)?.agents().iter().filter(|a| a.learner).count();
     let prior = config.prior.as_ref().map(ToString::to_string).unwrap_or_default();
     let text = |name: &str, value: &str| Column::new(name.into(), vec![value; n]);
-    let columns = vec![
+    vec![
         text("scenario", &config.scenario.name),
-        Column::new("agents".into(), vec![agents as i64; n]),
+        Column::new("agents".into(), vec![learners as i64; n]),
         text("algorithm", &config.algorithm),
         text("prior", &prior),
         Column::new("seed".into(), vec![config.seed as i64; n]),
@@ -81,6 +90,5 @@ pub fn write_evaluation(dir: &Path, config: &TrainConfig, rows: &[EvaluationRow]
         Column::new("episode".into(), rows.iter().map(|r| r.episode as i64).collect::<Vec<_>>()),
         Column::new("return".into(), rows.iter().map(|r| r.episode_return).collect::<Vec<_>>()),
         Column::new("loss_rate".into(), rows.iter().map(|r| r.loss_rate).collect::<Vec<_>>()),
-    ];
-    metrics::write_parquet(&dir.join("evaluation.parquet"), columns)
+    ]
 }

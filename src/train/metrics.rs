@@ -7,7 +7,7 @@ use polars::prelude::{Column, DataFrame, ParquetWriter};
 use super::{TrainError, tensorboard};
 
 /// The nullable columns of `metrics.parquet`, in order, each with what it says.
-pub const METRIC_COLUMNS: [(&str, &str); 14] = [
+pub const METRIC_COLUMNS: [(&str, &str); 15] = [
     ("return_mean", "mean return of the training episodes since the last row, with exploration noise"),
     ("td_loss", "mean squared TD error of the minibatches, before each step"),
     ("actor_objective", "mean Q(o, π(o, M)), which the actors climb"),
@@ -22,6 +22,14 @@ pub const METRIC_COLUMNS: [(&str, &str); 14] = [
     ("shaping_std", "standard deviation of the shaping bonus over the minibatch"),
     ("loss_rate", "share of messages lost in the training episodes since the last row"),
     ("noise_scale", "scale of the exploration noise"),
+    ("evaluation_return", "mean return of the last test over the training prior, without noise (protocol standard)"),
+];
+
+/// The columns before them, which every row has.
+pub const METRIC_KEYS: [(&str, &str); 3] = [
+    ("step", "environment steps so far, all worlds together"),
+    ("update", "updates so far"),
+    ("episode", "training episodes so far"),
 ];
 
 /// One row of metrics.
@@ -35,6 +43,26 @@ pub struct MetricsRow {
     pub episode: u64,
     /// Values in the order of [`METRIC_COLUMNS`]; `None` where nothing was measured.
     pub values: [Option<f64>; METRIC_COLUMNS.len()],
+}
+
+impl MetricsRow {
+    /// Numbers that a row is in a checkpoint.
+    pub(super) const NUMBERS: usize = METRIC_KEYS.len() + METRIC_COLUMNS.len();
+
+    pub(super) fn to_numbers(&self) -> Vec<f64> {
+        let keys = [self.step, self.update, self.episode].map(|key| key as f64);
+        keys.into_iter().chain(self.values.iter().map(|v| v.unwrap_or(f64::NAN))).collect()
+    }
+
+    pub(super) fn from_numbers(numbers: &[f64]) -> Self {
+        let at = |i: usize| numbers.get(i).copied().unwrap_or(f64::NAN);
+        Self {
+            step: at(0) as u64,
+            update: at(1) as u64,
+            episode: at(2) as u64,
+            values: std::array::from_fn(|i| Some(at(METRIC_KEYS.len() + i)).filter(|v| !v.is_nan())),
+        }
+    }
 }
 
 /// Means over a logging interval. Survives a checkpoint as plain numbers.

@@ -1,22 +1,33 @@
 //! Training: the loop that joins scenario, link, learner and Du-MIE; replay, checkpoints, observers, evaluation.
 
+mod arrays;
 mod checkpoint;
 pub mod config;
+mod difference;
+mod directory;
 pub mod dumie;
 mod estimator;
 mod evaluate;
+mod finite;
 mod metrics;
+mod protocol;
 pub mod replay;
 mod run;
 mod tensorboard;
+mod timings;
+mod trainer;
+mod warm;
 
 use std::path::PathBuf;
 
 pub use config::TrainConfig;
 pub use estimator::Estimator;
-pub use evaluate::{EVALUATION_COLUMNS, EvaluationRow, evaluate, write_evaluation};
-pub use metrics::{METRIC_COLUMNS, MetricsRow};
-pub use run::{Options, Progress, Report, Trainer, train};
+pub use evaluate::{EVALUATION_COLUMNS, EvaluationRow, evaluate, evaluation_seed, write_evaluation};
+pub use metrics::{METRIC_COLUMNS, METRIC_KEYS, MetricsRow};
+pub use protocol::{EvaluationConfig, Protocol, STANDARD_COLUMNS};
+pub use run::{Options, Progress, Report, train};
+pub use timings::TIMING_COLUMNS;
+pub use trainer::Trainer;
 
 /// What can go wrong with a training run.
 #[derive(Debug, thiserror::Error)]
@@ -59,11 +70,13 @@ pub enum TrainError {
     #[error("cannot train on this: {0}")]
     Store(String),
     /// Numbers stopped being numbers.
-    #[error("the run diverged at step {step}: {what} is no longer finite; lower the learning rates; the last good checkpoint is kept: {}", path.display())]
+    #[error("the run diverged at step {step}, update {update}: {what} is no longer finite; lower the learning rates; the last good checkpoint is kept: {}", path.display())]
     Diverged {
         /// Environment step.
         step: u64,
-        /// Which quantity.
+        /// Updates before.
+        update: u64,
+        /// Which tensor.
         what: String,
         /// Run directory.
         path: PathBuf,

@@ -39,12 +39,13 @@ fn updates(c: &mut Criterion) {
     for algorithm in ["maddpg", "fc-maddpg", "cc-maddpg"] {
         let config = TrainConfig::new(Spec::new("simple_spread"), algorithm).resolve().unwrap();
         let mut trainer = Trainer::new(config, Path::new("unused")).unwrap();
-        for _ in 0..400 {
+        while trainer.step() < 10_000 {
             trainer.advance(None).unwrap();
         }
         group.bench_function(algorithm, |b| {
             b.iter(|| {
-                for _ in 0..4 {
+                let end = trainer.step() + 100;
+                while trainer.step() < end {
                     trainer.advance(None).unwrap();
                 }
             });

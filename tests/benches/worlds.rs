@@ -6,7 +6,6 @@
 #![expect(clippy::unwrap_used, clippy::print_stdout, reason = "a benchmark prints, and panics where it cannot start")]
 
 use std::fmt::Write as _;
-use std::time::{Duration, Instant};
 
 use ccmarl::figure::{Curve, Data, FIGURES, Point, svg};
 use ccmarl::io::write_atomic;
@@ -79,9 +78,9 @@ fn measure(spec: &Spec, count: usize) -> f64 {
     let mut actions: Vec<Vec<f32>> = drawn.chunks_exact(count * total(|a| a.action)).map(<[f32]>::to_vec).collect();
     let mut best = f64::INFINITY;
     for _ in 0..REPEATS {
-        let start = cpu_seconds();
+        let start = cpu::seconds();
         let mut taken = 0;
-        while cpu_seconds() - start < LONG {
+        while cpu::seconds() - start < LONG {
             let next = taken + STEPS;
             while taken < next {
                 for (world, rng) in rngs.iter_mut().enumerate() {
@@ -95,18 +94,11 @@ fn measure(spec: &Spec, count: usize) -> f64 {
                 taken += 25 * count;
             }
         }
-        best = best.min((cpu_seconds() - start) / taken as f64);
+        best = best.min((cpu::seconds() - start) / taken as f64);
     }
     assert!(observations.iter().chain(&rewards).all(|v| v.is_finite()));
     1.0 / best
 }
 
-/// Seconds of CPU time of this process's first thread where Linux tells it, else of the clock.
-fn cpu_seconds() -> f64 {
-    static START: std::sync::OnceLock<Instant> = std::sync::OnceLock::new();
-    let told = std::fs::read_to_string("/proc/self/schedstat").ok();
-    match told.and_then(|text| text.split(' ').next()?.parse().ok()) {
-        Some(nanoseconds) => Duration::from_nanos(nanoseconds).as_secs_f64(),
-        None => START.get_or_init(Instant::now).elapsed().as_secs_f64(),
-    }
-}
+#[path = "cpu.rs"]
+mod cpu;

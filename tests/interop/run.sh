@@ -50,6 +50,20 @@ rm -f "$work/tag/store.rrd"
 "$bin/rerun" rrd verify "$work/tag/store.rrd" >/dev/null 2>&1
 "$bin/python" tests/interop/read_scene.py "$work/tag/store.mcap" "$work/tag/store.rrd"
 
+# a run: its tables described, its events in TensorBoard's own reader, its team in PyTorch where that is installed (a large
+# package: here, or as another python's in CCMARL_TORCH_PYTHON, with pyarrow and safetensors beside it)
+ccmarl train --scenario simple_spread --algorithm cc-maddpg --steps 30000 --evaluate standard --evaluate-every 10000 --force \
+    --out "$work/run" >/dev/null 2>&1
+ccmarl list metric --format json > "$work/metrics.json"
+"$bin/python" tests/interop/read_run.py "$work/run" "$work/metrics.json"
+ccmarl record --scenario simple_spread --policy "run:$work/run" --link dropout:0.3 --episodes 60 --force --out "$work/acted" >/dev/null 2>&1
+torch=${CCMARL_TORCH_PYTHON:-$bin/python}
+if "$torch" -c "import torch, safetensors" >/dev/null 2>&1; then
+    "$torch" tests/interop/act_in_pytorch.py "$work/run/checkpoint/actors.safetensors" "$work/acted"
+else
+    echo "skipped: no PyTorch (CCMARL_TORCH_PYTHON names a python that has it)"
+fi
+
 # what mpe2 does with a seed that no golden store has, written by Python, played again step by step
 rm -rf "$work/mpe2"
 PYTHONDONTWRITEBYTECODE=1 "$bin/python" datasets/golden/mpe2/record.py "$work/mpe2" --seed 7 >/dev/null

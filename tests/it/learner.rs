@@ -41,7 +41,12 @@ fn an_update_allocates_nothing_of_its_own_once_it_is_warm() {
         (MaddpgConfig::default(), DumieConfig::default()),
         (
             MaddpgConfig { messages: Messages::Off, actor_step: ActorStep::PerAgent, ..MaddpgConfig::default() },
-            DumieConfig { estimators: Estimators::PerLink, start: 50, pairs: PairSource::Replay, ..DumieConfig::default() },
+            DumieConfig {
+                estimators: Estimators::PerLink,
+                start: 50,
+                pairs: PairSource::Replay,
+                ..DumieConfig::default()
+            },
         ),
         (MaddpgConfig::default(), DumieConfig { negatives: Negatives::All, batch: 100, ..DumieConfig::default() }),
     ];
@@ -114,8 +119,12 @@ fn the_critic_reaches_the_closed_form_value_of_a_linear_quadratic_problem() {
         }
     }
     draw(&mut batch);
-    let joint: Vec<f32> =
-        batch.observations.chunks_exact(2).zip(batch.actions.chunks_exact(2)).flat_map(|(x, a)| [x, a].concat()).collect();
+    let joint: Vec<f32> = batch
+        .observations
+        .chunks_exact(2)
+        .zip(batch.actions.chunks_exact(2))
+        .flat_map(|(x, a)| [x, a].concat())
+        .collect();
     let mut tape = ccmarl::nn::Tape::default();
     let found = learner.critic.forward(&learner.params.critic.read(), &joint, rows, &mut tape);
     let exact: Vec<f32> = batch

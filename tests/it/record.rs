@@ -4,9 +4,14 @@ use std::io::{BufRead as _, BufReader};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use assert_cmd::Command;
+use ccmarl::algo::Actors;
 use ccmarl::link::{LINKS, Link};
-use ccmarl::record::{Options, POLICIES, Policy, RecordError, Recording, build_link, build_policy};
+use ccmarl::nn::{Activation, Tape};
+use ccmarl::record::{
+    ActionNoise, Options, POLICIES, Policy, RecordError, Recording, Trained, build_link, build_policy,
+};
 use ccmarl::registry::Spec;
+use ccmarl::rng::Seeds;
 use ccmarl::scenario::{self, SCENARIOS, Scenario, Scratch};
 use ccmarl::schema::{Episode, Manifest};
 use ccmarl::storage::{EpisodeSink, StorageError};
@@ -93,6 +98,62 @@ fn every_policy_fills_every_scenario_and_its_parameters_build_it_again() {
             assert!(error.contains("unknown field `nonsense`"), "{error}");
         }
     }
+}
+
+/// A team with fresh networks for a scenario.
+fn team(scenario: &dyn Scenario, noise: ActionNoise) -> (Trained, Vec<f32>) {
+    let learners: Vec<_> = scenario.agents().iter().filter(|a| a.learner).collect();
+    let actors = Actors::new(&learners, &[32, 32], Activation::Tanh, true);
+    let params = actors.init(&mut Seeds::new(5).stream("team"));
+    (Trained::new(actors, &params, noise, serde_json::Map::new()), params)
+}
+
+#[test]
+fn worlds_that_move_together_play_the_episodes_that_they_play_alone() {
+    let noise = ActionNoise::OrnsteinUhlenbeck { theta: 0.15, sigma: 0.2, scale: 0.3, episodes: 20 };
+    for scenario in SCENARIOS {
+        let mut parts = Parts::new(scenario.name, 2, "markov:heavy", "random");
+        let (trained, _) = team(&*parts.0, noise);
+        let policies: Vec<Box<dyn Policy>> = examples()
+            .map(|p| build_policy(&Spec::parse("policy", POLICIES, p).unwrap(), &*parts.0).unwrap())
+            .chain([Box::new(trained) as Box<dyn Policy>])
+            .collect();
+        for policy in policies {
+            parts.2 = policy;
+            let recording = parts.recording(1, 0);
+            let together = recording.together(&recording.layout(), 13, 11);
+            for (episode, index) in together.iter().zip(13..) {
+                assert!(*episode == recording.episode(index), "{} {:?}", scenario.name, parts.2.parameters());
+            }
+        }
+    }
+}
+
+#[test]
+fn a_team_acts_on_its_observation_and_the_messages_that_arrived_and_its_noise_falls_to_zero() {
+    let mut parts = Parts::new("simple_adversary", 3, "dropout:0.5", "random");
+    let (trained, params) = team(&*parts.0, ActionNoise::None);
+    let actors = trained.actors.clone();
+    parts.2 = Box::new(trained);
+    let calm = parts.recording(1, 0).together(&parts.recording(1, 0).layout(), 4, 1).remove(0);
+    let mut tape = Tape::default();
+    for row in 0..calm.steps {
+        let observations: Vec<f32> = calm.observations.iter().flat_map(|o| o.row(row).to_vec()).collect();
+        for i in 0..3 {
+            let mut input = Vec::new();
+            actors.push_input(i, &observations, &calm.link[row * 9..row * 9 + 9], &mut input);
+            let expected = actors.act(&params, i, &input, 1, &mut tape);
+            let error = expected.iter().zip(calm.actions[i].row(row)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(error < 1e-6, "{error}");
+        }
+    }
+    let noise = ActionNoise::OrnsteinUhlenbeck { theta: 0.15, sigma: 0.2, scale: 0.3, episodes: 4 };
+    assert_eq!([0, 1, 2, 4, 9].map(|episode| noise.scale(episode)), [0.3, 0.3 * 3.0 / 4.0, 0.15, 0.0, 0.0]);
+    parts.2 = Box::new(team(&*parts.0, noise).0);
+    let layout = parts.recording(1, 0).layout();
+    let noisy = parts.recording(1, 0).together(&layout, 3, 2);
+    assert_ne!(noisy[0].actions, parts.recording(1, 0).episode(4).actions);
+    assert_eq!(noisy[1].actions, calm.actions, "no noise is left in episode 4");
 }
 
 #[test]

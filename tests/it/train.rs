@@ -4,7 +4,8 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use ccmarl::registry::Spec;
-use ccmarl::train::{Options, Report, TrainConfig, Trainer, train};
+use ccmarl::train::{EvaluationConfig, Options, Protocol, Report, TrainConfig, Trainer, train};
+use polars::prelude::{DataFrame, ParquetReader, SerReader as _};
 
 fn config(algorithm: &str, steps: u64) -> TrainConfig {
     let mut config = TrainConfig::new(Spec::new("simple_spread"), algorithm);
@@ -21,6 +22,33 @@ fn run(config: TrainConfig, dir: &Path, options: &Options<'_>) -> Report {
 
 fn bytes(dir: &Path, file: &str) -> Vec<u8> {
     std::fs::read(dir.join(file)).unwrap_or_else(|e| panic!("{file}: {e}"))
+}
+
+/// Files below a directory, by their paths from there.
+fn walk(dir: &Path) -> Vec<String> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(dir).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_name().unwrap().to_str().unwrap().to_owned();
+        if path.is_dir() {
+            found.extend(walk(&path).into_iter().map(|below| format!("{name}/{below}")));
+        } else {
+            found.push(name);
+        }
+    }
+    found
+}
+
+fn frame(path: &Path) -> DataFrame {
+    ParquetReader::new(std::fs::File::open(path).unwrap()).finish().unwrap()
+}
+
+fn ints(frame: &DataFrame, column: &str) -> Vec<i64> {
+    frame.column(column).unwrap().i64().unwrap().iter().map(|v| v.unwrap()).collect()
+}
+
+fn texts(frame: &DataFrame, column: &str) -> Vec<String> {
+    frame.column(column).unwrap().str().unwrap().iter().map(|v| v.unwrap().to_owned()).collect()
 }
 
 const LEARNED: [&str; 3] = ["checkpoint/actors.safetensors", "metrics.parquet", "events.out.tfevents.ccmarl"];
@@ -101,16 +129,202 @@ fn every_option_of_learner_and_estimators_trains_differently_and_resumes_to_the_
 }
 
 #[test]
-fn a_resumed_run_refuses_a_changed_configuration_and_names_the_difference() {
+fn a_resumed_run_refuses_a_changed_configuration_and_names_every_difference() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("run");
     run(config("maddpg", 500), &path, &Options::default());
+    let before = bytes(&path, "config.toml");
+    let resumed = |config: TrainConfig| {
+        let options = Options { resume: true, ..Options::default() };
+        train(config, &path, &options, &mut |_| {}, &AtomicBool::new(false)).map_err(|e| e.to_string())
+    };
     let mut changed = config("maddpg", 500);
     changed.maddpg.gamma = 0.9;
-    let error =
-        train(changed, &path, &Options { resume: true, ..Options::default() }, &mut |_| {}, &AtomicBool::new(false));
-    let error = error.unwrap_err().to_string();
-    assert!(error.contains("the configuration changed") && error.contains("gamma = 0.9"), "{error}");
+    changed.scenario = changed.scenario.with("view_radius", 0.5);
+    let error = resumed(changed).unwrap_err();
+    let fault = "the configuration changed: maddpg.gamma was 0.95, is 0.9; scenario.view_radius was 0.25, is 0.5";
+    assert!(error.starts_with(&format!("cannot resume: {fault}; give the old values")), "{error}");
+    let error = resumed(config("maddpg", 400)).unwrap_err();
+    assert!(error.contains("the run has taken 500 steps, --steps 400 lie behind it: give at least 500"), "{error}");
+    assert_eq!(bytes(&path, "config.toml"), before, "a refused command changed the configuration");
+}
+
+#[test]
+fn a_run_that_goes_on_for_longer_is_the_run_of_that_length() {
+    let dir = tempfile::tempdir().unwrap();
+    let [long, grown] = ["long", "grown"].map(|name| dir.path().join(name));
+    let standard = |steps: u64| {
+        let mut config = config("cc-maddpg", steps);
+        config.evaluation = EvaluationConfig { protocol: Protocol::Standard, every: 700, episodes: Some(2) };
+        config
+    };
+    run(standard(4000), &long, &Options::default());
+    run(standard(2510), &grown, &Options::default());
+    run(standard(4000), &grown, &Options { resume: true, ..Options::default() });
+    for file in
+        LEARNED.into_iter().chain(["checkpoint/state.safetensors", "config.toml", "evaluation_standard.parquet"])
+    {
+        assert!(bytes(&long, file) == bytes(&grown, file), "{file}");
+    }
+}
+
+#[test]
+fn worlds_stepped_together_are_the_papers_order_as_long_as_no_update_lies_between_them() {
+    let dir = tempfile::tempdir().unwrap();
+    let updates: Vec<u64> = [1, 2, 3, 4, 16]
+        .map(|envs| {
+            let mut config = config("cc-maddpg", 4000);
+            config.envs = Some(envs);
+            run(config, &dir.path().join(envs.to_string()), &Options::default()).updates
+        })
+        .to_vec();
+    assert_eq!(updates, [30; 5], "one update per 100 steps after the first 1024, however many worlds");
+    for file in LEARNED {
+        for envs in ["2", "3", "4"] {
+            assert!(
+                bytes(&dir.path().join("1"), file) == bytes(&dir.path().join(envs), file),
+                "{file} of {envs} worlds"
+            );
+        }
+        assert!(bytes(&dir.path().join("1"), file) != bytes(&dir.path().join("16"), file));
+    }
+    assert_eq!(config("maddpg", 100).resolve().unwrap().envs, Some(4), "four episodes of 25 steps per 100");
+}
+
+#[test]
+fn the_standard_protocol_tests_at_intervals_and_the_best_again_and_disturbs_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let [plain, tested, parts] = ["plain", "tested", "parts"].map(|name| dir.path().join(name));
+    let standard = || {
+        let mut config = config("fc-maddpg", 3000);
+        config.evaluation = EvaluationConfig { protocol: Protocol::Standard, every: 1000, episodes: Some(3) };
+        config
+    };
+    run(config("fc-maddpg", 3000), &plain, &Options::default());
+    run(standard(), &tested, &Options::default());
+    assert!(bytes(&plain, LEARNED[0]) == bytes(&tested, LEARNED[0]), "tests changed what was learned");
+    let table = frame(&tested.join("evaluation_standard.parquet"));
+    let (step, channel) = (ints(&table, "step"), texts(&table, "channel"));
+    let best: Vec<bool> = table.column("best").unwrap().bool().unwrap().iter().map(|b| b.unwrap()).collect();
+    assert_eq!(step[..9], [1000, 1000, 1000, 2000, 2000, 2000, 3000, 3000, 3000]);
+    assert_eq!((step.len(), best.iter().filter(|b| **b).count()), (9 + 9 * 30, 9 * 30));
+    assert!(channel[..39].iter().all(|c| c == "prior") && channel[39] == "unrestricted");
+    let returns = table.column("return").unwrap().f64().unwrap().clone();
+    let mean = |at: usize| (at..at + 3).map(|i| returns.get(i).unwrap()).sum::<f64>() / 3.0;
+    let highest = [0, 3, 6].into_iter().max_by(|&a, &b| mean(a).total_cmp(&mean(b))).unwrap();
+    assert_eq!(step[9], step[highest], "the best is the one with the highest mean");
+    // the file of the best is a policy like any other
+    let scenario = ccmarl::scenario::build(&Spec::new("simple_spread")).unwrap();
+    let file = tested.join("checkpoint/best.safetensors");
+    let team = ccmarl::record::Trained::load(&file, scenario.as_ref(), ccmarl::record::ActionNoise::None).unwrap();
+    assert_eq!(team.actors.steps as i64, step[9]);
+    // stopped between two tests
+    let stop = AtomicBool::new(false);
+    let mut progress = |p: ccmarl::train::Progress| stop.store(p.step >= 1500, Ordering::Relaxed);
+    assert!(train(standard(), &parts, &Options::default(), &mut progress, &stop).unwrap().interrupted);
+    assert!(!parts.join("evaluation_standard.parquet").exists());
+    run(standard(), &parts, &Options { resume: true, ..Options::default() });
+    for file in LEARNED.into_iter().chain(["checkpoint/best.safetensors", "evaluation_standard.parquet"]) {
+        assert!(bytes(&tested, file) == bytes(&parts, file), "{file}");
+    }
+}
+
+#[test]
+fn the_paper_protocol_writes_what_the_command_would() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("run");
+    let mut config = config("maddpg", 500);
+    config.evaluation = EvaluationConfig { protocol: Protocol::Paper, episodes: Some(4), ..Default::default() };
+    run(config, &path, &Options::default());
+    let own = bytes(&path, "evaluation.parquet");
+    std::fs::remove_file(path.join("evaluation.parquet")).unwrap();
+    let words = ["evaluate", path.to_str().unwrap(), "--episodes", "4"];
+    assert_eq!(
+        assert_cmd::Command::new(env!("CARGO_BIN_EXE_ccmarl")).args(words).output().unwrap().status.code(),
+        Some(0)
+    );
+    assert!(own == bytes(&path, "evaluation.parquet"));
+}
+
+#[test]
+fn a_kill_before_the_first_checkpoint_leaves_no_run_and_one_amid_a_write_leaves_nothing_for_good() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("run");
+    let resume = Options { resume: true, ..Options::default() };
+    let error = train(config("maddpg", 500), &path, &resume, &mut |_| {}, &AtomicBool::new(false)).unwrap_err();
+    assert!(error.to_string().starts_with("cannot resume: there is no checkpoint; start without --resume"), "{error}");
+    // what such a kill leaves
+    ccmarl::io::write_atomic(&dir.path().join(".run.partial/config.toml"), b"half").unwrap();
+    run(config("maddpg", 500), &path, &Options::default());
+    assert!(!dir.path().join(".run.partial").exists());
+    for leftover in [".metrics.parquet.a1B2c3", "checkpoint/.state.safetensors.XyZ123"] {
+        ccmarl::io::write_atomic(&path.join(leftover), b"half").unwrap();
+    }
+    run(config("maddpg", 1000), &path, &resume);
+    let words = ["train", "--resume", "--out", dir.path().join("nosuch").to_str().unwrap()].map(ToOwned::to_owned);
+    let output = assert_cmd::Command::new(env!("CARGO_BIN_EXE_ccmarl")).args(words).output().unwrap();
+    let err = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    assert!(
+        err.starts_with("error: cannot resume: there is no run to go on with; start it without --resume: "),
+        "{err}"
+    );
+    let mut names: Vec<_> = walk(&path);
+    names.sort();
+    let expected = [
+        "checkpoint/actors.safetensors",
+        "checkpoint/state.safetensors",
+        "config.toml",
+        "events.out.tfevents.ccmarl",
+        "metrics.parquet",
+        "timings.parquet",
+    ];
+    assert_eq!(names, expected);
+    ccmarl::io::write_atomic(&path.join(".metrics.parquet.a1B2c3"), b"half").unwrap();
+    run(config("maddpg", 500), &path, &Options { force: true, ..Options::default() });
+}
+
+#[test]
+fn a_damaged_checkpoint_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("run");
+    run(config("maddpg", 500), &path, &Options::default());
+    let mut state = bytes(&path, "checkpoint/state.safetensors");
+    let last = state.len() - 5;
+    state[last] ^= 16;
+    ccmarl::io::write_atomic(&path.join("checkpoint/state.safetensors"), &state).unwrap();
+    let resume = Options { resume: true, ..Options::default() };
+    let error = train(config("maddpg", 900), &path, &resume, &mut |_| {}, &AtomicBool::new(false)).unwrap_err();
+    assert!(error.to_string().contains("its content does not match its digest"), "{error}");
+}
+
+#[cfg(unix)]
+#[test]
+fn a_terminated_run_saves_itself_exits_4_and_goes_on() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("run");
+    let out = path.to_str().unwrap();
+    let words = ["train", "--scenario", "simple_spread", "--algorithm", "maddpg", "--steps", "100000000", "--out", out];
+    for signal in ["-TERM", "-INT"] {
+        let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_ccmarl"));
+        let resumed = ["train", "--out", out, "--resume"];
+        command.args(if signal == "-TERM" { &words[..] } else { &resumed[..] });
+        let child = command.stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped()).spawn().unwrap();
+        // the signal handler stands before the run directory does
+        for _ in 0..600 {
+            if path.join("checkpoint/state.safetensors").exists() {
+                break;
+            }
+            std::thread::sleep(std::time::Duration::from_millis(50));
+        }
+        std::thread::sleep(std::time::Duration::from_millis(300));
+        let id = child.id().to_string();
+        assert!(std::process::Command::new("kill").args([signal, &id]).status().unwrap().success());
+        let output = child.wait_with_output().unwrap();
+        let err = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(4), "{signal}: {err}");
+        assert!(err.contains("interrupted and saved; go on with: ccmarl train --out"), "{err}");
+    }
 }
 
 #[test]
@@ -149,7 +363,7 @@ fn a_warm_start_fills_the_rings_as_the_rollouts_did() {
     run(config("cc-maddpg", 900), &dir.path().join("a"), &Options { record: Some(&store), ..Options::default() });
     let resolved = config("cc-maddpg", 900).resolve().unwrap();
     let [mut rolled, mut warm] = [(); 2].map(|()| Trainer::new(resolved.clone(), dir.path()).unwrap());
-    for _ in 0..36 {
+    while rolled.step() < 900 {
         rolled.advance(None).unwrap();
     }
     warm.warm_start(ccmarl::storage::open(&store).unwrap().as_mut()).unwrap();
@@ -214,13 +428,61 @@ fn a_store_of_other_agents_is_refused_by_name() {
 }
 
 #[test]
-fn a_run_that_diverges_stops_and_names_the_step() {
+fn a_run_that_diverges_stops_names_step_and_tensor_and_keeps_the_last_good_checkpoint() {
     let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a");
     let mut wild = config("maddpg", 5000);
     wild.maddpg.critic_learning_rate = 1e30;
-    let error =
-        train(wild, &dir.path().join("a"), &Options::default(), &mut |_| {}, &AtomicBool::new(false)).unwrap_err();
-    assert!(error.to_string().contains("diverged at step 1"), "{error}");
+    wild.checkpoint_every = 1;
+    let error = train(wild.clone(), &path, &Options::default(), &mut |_| {}, &AtomicBool::new(false)).unwrap_err();
+    let error = error.to_string();
+    assert!(
+        error.starts_with("the run diverged at step 1") && error.contains(".weight is no longer finite; "),
+        "{error}"
+    );
+    assert!(error.contains("the last good checkpoint is kept"), "{error}");
+    let mut kept = Trainer::new(wild.resolve().unwrap(), &path).unwrap();
+    kept.resume().unwrap();
+    assert!(kept.learner.params.critic.read().iter().all(|p| p.is_finite()));
+}
+
+#[test]
+fn shaping_a_preset_that_has_none_is_refused_with_the_one_that_has() {
+    for (algorithm, prior) in [("maddpg", "none"), ("fc-maddpg", "perfect"), ("dropout-maddpg-0.5", "dropout:0.5")] {
+        let mut shaped = config(algorithm, 500);
+        shaped.dumie.alpha = Some(0.01);
+        let error = shaped.resolve().unwrap_err().to_string();
+        let expected =
+            format!("dumie.alpha: {algorithm} is not shaped, found 0.01: take cc-maddpg with --prior {prior}, ");
+        assert!(error.starts_with(&expected), "{error}");
+    }
+    let mut unshaped = config("maddpg", 500);
+    unshaped.dumie.beta = Some(0.0);
+    unshaped.resolve().unwrap();
+}
+
+#[test]
+fn a_team_is_refused_in_a_world_with_other_constants_and_each_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("run");
+    run(config("maddpg", 500), &path, &Options::default());
+    let policy = Spec::new("run").with("path", path.to_str().unwrap());
+    let play = |scenario: Spec| {
+        let scenario = ccmarl::scenario::build(&scenario).unwrap();
+        ccmarl::record::build_policy(&policy, scenario.as_ref()).map(|_| ()).map_err(|e| e.to_string())
+    };
+    let spread = || Spec::new("simple_spread");
+    assert_eq!(play(spread()), Ok(()));
+    let error = play(spread().with("view_radius", 0.5).with("steps", 50)).unwrap_err();
+    let expected = "the run does not fit this scenario: steps was 25 in training and is 50 here, view_radius was 0.25 in \
+                    training and is 0.5 here: ";
+    assert!(error.starts_with(expected), "{error}");
+    let error = play(spread().with("agents", 4)).unwrap_err();
+    assert!(error.contains("agents was 3 in training and is 4 here"), "{error}");
+    let error = play(spread().with("profile", "mpe2")).unwrap_err();
+    assert!(error.contains("profile was \"paper\" in training") && error.contains("decoder was"), "{error}");
+    let error = play(Spec::new("simple_tag")).unwrap_err();
+    assert!(error.contains("name was \"simple_spread\" in training and is \"simple_tag\" here"), "{error}");
 }
 
 #[test]
@@ -253,7 +515,13 @@ fn configurations_are_refused_with_their_line_or_their_name() {
     let discrete = choosing.resolve().unwrap_err().to_string();
     assert_eq!(discrete, "scenario.discrete: this learner's actions are continuous: set it to false");
     let scenario = read("algorithm = \"maddpg\"\nscenario = { name = \"simple_spread\", agnets = 3 }\n").unwrap_err();
-    assert!(scenario.contains("unknown field `agnets`"), "{scenario}");
+    assert!(scenario.contains("line 2") && scenario.contains("unknown field `agnets`"), "{scenario}");
+    let prior = read(&format!("# dropout\n{start}[prior]\nname = \"dropout\"\np = 2\n")).unwrap_err();
+    assert!(prior.contains("line 5: dropout: p must be in [0, 1], found 2"), "{prior}");
+    let link = read(&format!("{start}prior = \"dropuot\"\n")).unwrap_err();
+    assert!(link.contains("line 3: unknown link \"dropuot\": did you mean dropout"), "{link}");
+    let envs = read(&format!("envs = 0\n{start}")).unwrap_err();
+    assert_eq!(envs, "envs: expected 1 to 4096, found 0");
 }
 
 #[test]

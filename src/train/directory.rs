@@ -1,0 +1,97 @@
+//! A run directory: what may lie in it, how it appears, and what a kill leaves in it.
+
+use std::path::Path;
+
+use super::protocol::STANDARD_FILE;
+use super::{TrainConfig, TrainError, Trainer};
+use crate::io::{self, IoError};
+
+/// What a run directory may hold; anything else in it is somebody's own.
+const RUN_FILES: [&str; 8] = [
+    CONFIG,
+    "metrics.parquet",
+    "timings.parquet",
+    "evaluation.parquet",
+    STANDARD_FILE,
+    "mi.parquet",
+    "events.out.tfevents.ccmarl",
+    CHECKPOINTS,
+];
+
+/// The configuration, fully resolved; says that a directory is a run.
+pub(super) const CONFIG: &str = "config.toml";
+const CHECKPOINTS: &str = "checkpoint";
+
+/// Refuses an output directory that exists, or with `force` one that is not just a run.
+pub(super) fn refuse_foreign(dir: &Path, force: bool) -> Result<(), TrainError> {
+    io::refuse_existing(dir, force)?;
+    if !dir.exists() {
+        return Ok(());
+    }
+    let names = names(dir)?;
+    let known = names.iter().all(|name| RUN_FILES.contains(&name.as_str()) || is_leftover(name));
+    let run = names.is_empty() || TrainConfig::read(&dir.join(CONFIG)).is_ok();
+    if known && run { Ok(()) } else { Err(IoError::Foreign(dir.to_owned()).into()) }
+}
+
+/// Makes the directory of a run that has not taken a step: with its configuration and first checkpoint it appears under
+/// its name, and only then is what was there gone.
+pub(super) fn create(trainer: &mut Trainer, force: bool) -> Result<(), TrainError> {
+    let dir = trainer.dir.clone();
+    let partial = io::partial_path(&dir);
+    io::remove(&partial)?;
+    trainer.dir.clone_from(&partial);
+    let saved = write_config(trainer).and_then(|()| trainer.save());
+    trainer.dir.clone_from(&dir);
+    saved?;
+    Ok(io::publish(&partial, &dir, force, CONFIG)?)
+}
+
+/// Writes `config.toml`.
+pub(super) fn write_config(trainer: &Trainer) -> Result<(), TrainError> {
+    Ok(io::write_atomic(&trainer.dir.join(CONFIG), trainer.config.to_toml()?.as_bytes())?)
+}
+
+/// Removes files that were being written when a kill came.
+pub(super) fn remove_leftovers(dir: &Path) -> Result<(), TrainError> {
+    for folder in [dir.to_owned(), dir.join(CHECKPOINTS)] {
+        if folder.is_dir() {
+            for name in names(&folder)?.iter().filter(|name| is_leftover(name)) {
+                io::remove(&folder.join(name))?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Whether a name is that of a file on its way to one of a run's names: `.<name>.` and random letters.
+fn is_leftover(name: &str) -> bool {
+    let Some((stem, ending)) = name.strip_prefix('.').and_then(|rest| rest.rsplit_once('.')) else { return false };
+    let ours = RUN_FILES.contains(&stem) || stem.ends_with(".safetensors");
+    ours && ending.len() == 6 && ending.chars().all(|c| c.is_ascii_alphanumeric())
+}
+
+/// Names in a directory; one that is not UTF-8 is nobody's of ours.
+fn names(dir: &Path) -> Result<Vec<String>, TrainError> {
+    let mut names = Vec::new();
+    for entry in std::fs::read_dir(dir).map_err(IoError::os("list", dir))? {
+        names.push(entry.map_err(IoError::os("list", dir))?.file_name().to_string_lossy().into_owned());
+    }
+    Ok(names)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn leftovers_are_told_from_what_somebody_put_there() {
+        for ours in [".metrics.parquet.a1B2c3", ".state.safetensors.ABCdef", ".config.toml.000000"] {
+            assert!(is_leftover(ours), "{ours}");
+        }
+        for foreign in ["metrics.parquet.a1B2c3", ".thesis.tex.a1B2c3", ".metrics.parquet.a1B2c34", ".metrics.parquet"]
+        {
+            assert!(!is_leftover(foreign), "{foreign}");
+        }
+    }
+}
