@@ -147,13 +147,16 @@ impl EpisodeSource for Leftover {
     }
 }
 
+/// Where the text of a manifest may be found; `None` where none was written yet.
+type Candidate = Box<dyn Fn() -> Result<Option<String>, StorageError>>;
+
 /// The manifest: that of the directory, of the newest journal that has a whole one, or of the first part. `None` when
 /// there is none, and nothing is damaged.
 fn manifest(directory: &Path) -> Result<Option<Manifest>, StorageError> {
     let parse = |text: &str| {
         Manifest::parse(text).map_err(|source| StorageError::Schema { source, path: directory.to_owned() })
     };
-    let mut candidates: Vec<Box<dyn Fn() -> Result<Option<String>, StorageError>>> = Vec::new();
+    let mut candidates: Vec<Candidate> = Vec::new();
     let (own, part) = (directory.join(MANIFEST_FILE), directory.join(part_name(0)));
     if own.is_file() {
         candidates.push(Box::new(move || Ok(Some(io::read_text(&own, MANIFEST_LIMIT)?))));
