@@ -14,6 +14,7 @@
 //!
 //! # Parameters
 //! Whether viewers' topics are written (they are by default). A chunk ends with each episode (and at 1 MiB), zstd, one thread, so that the bytes are the same anywhere.
+//! The container's index of chunks is kept in memory until the end, about 600 bytes per episode.
 //!
 //! # When it fails
 //! A file that was cut short is an error that counts its whole episodes. All checksums are checked before anything is

@@ -1,5 +1,8 @@
 //! What a kill leaves of a directory or file: sealed parts, and the journals of those that were being written.
 
+use std::collections::BTreeSet;
+use std::fs::File;
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::Receiver;
 
@@ -10,7 +13,7 @@ use super::sink::part_name;
 use super::source::check_file;
 use super::{MANIFEST_FILE, MANIFEST_KEY, PART_KEY, entry, footer};
 use crate::io::{self, IoError};
-use crate::schema::{Episode, Layout, Manifest, Part, SchemaError};
+use crate::schema::{Episode, Layout, Manifest, SchemaError};
 use crate::storage::tally::check;
 use crate::storage::{EpisodeSource, MANIFEST_LIMIT, StorageError, Tally};
 
@@ -18,8 +21,8 @@ use crate::storage::{EpisodeSource, MANIFEST_LIMIT, StorageError, Tally};
 pub(super) struct Leftover {
     directory: PathBuf,
     manifest: Manifest,
-    /// The sealed parts, as the journal after them or the manifest knows them.
-    known: Vec<Part>,
+    /// Digests that stand in the journals and the manifest, those of sealed parts' content among them.
+    noted: BTreeSet<String>,
     layout: Layout,
     next_part: usize,
     current: Option<Open>,
@@ -37,18 +40,18 @@ struct Open {
 impl Leftover {
     pub(super) fn open(directory: &Path) -> Result<Self, StorageError> {
         let manifest = manifest(directory)?.ok_or_else(|| StorageError::Empty { path: directory.to_owned() })?;
-        let (known, manifest) = (manifest.parts.clone(), manifest.unsealed());
+        let (manifest, noted) = (manifest.unsealed(), noted(directory)?);
         let layout = manifest.layout();
         let (directory, total) = (directory.to_owned(), Tally::default());
-        Ok(Self { directory, manifest, known, layout, next_part: 0, current: None, total })
+        Ok(Self { directory, manifest, noted, layout, next_part: 0, current: None, total })
     }
 
     /// The next part, or its journal where it was not sealed; false when there is neither.
     fn open_next(&mut self) -> Result<bool, StorageError> {
         let k = self.next_part;
         let (part, journal) = (self.directory.join(part_name(k)), self.directory.join(journal_name(k)));
-        let (decoder, path, notes) = if part.is_file() && (k < self.known.len() || !journal.is_file()) {
-            self.vouch(k, &part)?;
+        let (decoder, path, notes) = if part.is_file() && !journal.is_file() {
+            self.vouch(&part)?;
             (Decoder::open(&part, &self.layout)?, part, None)
         } else if !journal.is_file() {
             return self.end(k, "is missing").map(|()| false);
@@ -63,26 +66,25 @@ impl Leftover {
         Ok(true)
     }
 
-    /// Checks a sealed part before any of its episodes is given out: its own digest, or that of its content.
-    fn vouch(&self, k: usize, path: &Path) -> Result<(), StorageError> {
-        let damaged = |message: &str| Err(StorageError::Damaged { message: message.to_owned(), path: path.to_owned() });
-        let Some(part) = self.known.get(k) else {
-            return match check_file(path) {
-                Err(StorageError::NotAStore { .. }) => damaged("nothing that is left has a digest of this part"),
-                checked => checked,
-            };
-        };
-        let (mut decoder, mut tally, mut next) =
-            (Decoder::open(path, &self.layout)?, Tally::default(), part.episodes[0]);
-        while let Some(episode) = decoder.next_episode(next)? {
+    /// Checks a sealed part before any of its episodes is given out: its own digest, or that of its content, which must
+    /// have been noted. A digest that fits is no accident, so that it does not matter where it stands.
+    fn vouch(&self, path: &Path) -> Result<(), StorageError> {
+        match check_file(path) {
+            Err(StorageError::NotAStore { .. }) => {}
+            checked => return checked,
+        }
+        let (mut decoder, mut tally) = (Decoder::open(path, &self.layout)?, Tally::default());
+        loop {
+            let next = self.total.episodes + tally.episodes;
+            let Some(episode) = decoder.next_episode(next)? else { break };
             let hash = check(&self.layout, &episode, next);
             tally.add(&episode, &hash.map_err(|source| StorageError::Schema { source, path: path.to_owned() })?);
-            next += 1;
         }
-        if next != part.episodes[1] || tally.content() != part.content {
-            return damaged("its episodes do not have the digest that was noted when it was sealed");
+        if self.noted.contains(&tally.content()) {
+            return Ok(());
         }
-        Ok(())
+        let message = "no journal and no manifest that is left has the digest of its episodes".to_owned();
+        Err(StorageError::Damaged { message, path: path.to_owned() })
     }
 
     /// Part or journal `k` is the last of which anything is there; refused when a later one is.
@@ -145,38 +147,60 @@ impl EpisodeSource for Leftover {
     }
 }
 
+/// Where the text of a manifest may be found; `None` where none was written yet.
+type Candidate = Box<dyn Fn() -> Result<Option<String>, StorageError>>;
+
 /// The manifest: that of the directory, of the newest journal that has a whole one, or of the first part. `None` when
 /// there is none, and nothing is damaged.
 fn manifest(directory: &Path) -> Result<Option<Manifest>, StorageError> {
     let parse = |text: &str| {
         Manifest::parse(text).map_err(|source| StorageError::Schema { source, path: directory.to_owned() })
     };
-    let path = directory.join(MANIFEST_FILE);
-    if path.is_file() {
-        return parse(&io::read_text(&path, MANIFEST_LIMIT)?).map(Some);
+    let mut candidates: Vec<Candidate> = Vec::new();
+    let (own, part) = (directory.join(MANIFEST_FILE), directory.join(part_name(0)));
+    if own.is_file() {
+        candidates.push(Box::new(move || Ok(Some(io::read_text(&own, MANIFEST_LIMIT)?))));
+    }
+    for journal in journals(directory)? {
+        candidates.push(Box::new(move || {
+            let opened = JournalReader::open(&journal)?; // none: it was begun when the kill came
+            Ok(opened.map(|(reader, _)| reader.schema().metadata().get(MANIFEST_KEY).cloned().unwrap_or_default()))
+        }));
+    }
+    if part.is_file() {
+        candidates.push(Box::new(move || {
+            let metadata = footer(&part)?;
+            let text = entry(&metadata, PART_KEY).or_else(|| entry(&metadata, MANIFEST_KEY));
+            Ok(Some(text.unwrap_or_default().to_owned()))
+        }));
     }
     let mut fault = None;
-    for journal in journals(directory)? {
-        match JournalReader::open(&journal) {
-            Ok(None) => {} // it was begun when the kill came
-            Ok(Some((reader, _))) => {
-                let text = reader.schema().metadata().get(MANIFEST_KEY).cloned().unwrap_or_default();
-                match parse(&text) {
-                    Err(error @ StorageError::Schema { source: SchemaError::Version { .. }, .. }) => return Err(error),
-                    Err(error) => fault = Some(error),
-                    manifest => return manifest.map(Some),
-                }
-            }
+    for text in candidates {
+        match text().and_then(|text| text.map(|text| parse(&text)).transpose()) {
+            Ok(None) => {}
+            Ok(manifest) => return Ok(manifest),
+            Err(error @ StorageError::Schema { source: SchemaError::Version { .. }, .. }) => return Err(error),
             Err(error) => fault = Some(error),
         }
     }
-    let part = directory.join(part_name(0));
-    if part.is_file() {
-        let metadata = footer(&part)?;
-        let text = entry(&metadata, PART_KEY).or_else(|| entry(&metadata, MANIFEST_KEY)).unwrap_or_default();
-        return parse(text).map(Some);
-    }
     fault.map_or(Ok(None), Err)
+}
+
+/// How much of a journal is searched for digests: its manifest stands at the beginning.
+const NOTED_LIMIT: u64 = 16 << 20;
+
+/// Everything in the journals and the manifest that has the form of a digest, damaged or not.
+fn noted(directory: &Path) -> Result<BTreeSet<String>, StorageError> {
+    let mut found = BTreeSet::new();
+    let own = directory.join(MANIFEST_FILE);
+    for path in journals(directory)?.into_iter().chain(own.is_file().then_some(own)) {
+        let file = File::open(&path).map_err(IoError::os("open", &path))?;
+        let mut bytes = Vec::new();
+        file.take(NOTED_LIMIT).read_to_end(&mut bytes).map_err(IoError::os("read", &path))?;
+        let words = bytes.split(|byte| !byte.is_ascii_hexdigit()).filter(|word| word.len() == 64);
+        found.extend(words.map(|word| String::from_utf8_lossy(word).into_owned()));
+    }
+    Ok(found)
 }
 
 /// The journals that are there, newest first.
