@@ -40,7 +40,7 @@ fn main() {
         let path = directory.path().join(form);
         let record = || {
             let mut sink = storage::create(&path, &manifest, true).unwrap();
-            recording.record(&mut *sink, Options { threads: option("--threads", "0").parse().unwrap(), block: option("--block", "0").parse().unwrap() }, &mut |_| {}, &AtomicBool::new(false)).unwrap();
+            recording.record(&mut *sink, Options::default(), &mut |_| {}, &AtomicBool::new(false)).unwrap();
             sink.finish().unwrap();
         };
         record();
@@ -54,7 +54,11 @@ fn main() {
             let rate = gigabytes.map(|bytes| format!("{:.3}", bytes as f64 / wall / 1e9)).unwrap_or_default();
             let (steps, bytes) = (steps as f64, bytes(&path));
             let share = bytes as f64 / raw as f64;
-            println!("{what},{form},{:.0},{:.0},{wall:.3},{cpu:.3},{rate},{bytes},{share:.3}", steps / wall, steps / cpu);
+            println!(
+                "{what},{form},{:.0},{:.0},{wall:.3},{cpu:.3},{rate},{bytes},{share:.3}",
+                steps / wall,
+                steps / cpu
+            );
         };
         line("record", None, &record);
         // decoded: observations, messages, actions and the team reward as f32, a byte per link

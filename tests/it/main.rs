@@ -13,6 +13,7 @@ mod links;
 mod mi;
 mod record;
 mod report;
+mod rows;
 mod stats;
 mod stores;
 mod train;

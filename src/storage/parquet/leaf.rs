@@ -4,8 +4,6 @@
 //! element, which costs more than all else in reading; ours have a fixed width, so here the levels are only checked.
 
 use std::collections::VecDeque;
-use std::fs::File;
-use std::io::{self, BufReader, Read};
 use std::sync::Arc;
 
 use arrow::array::{ArrayRef, BooleanArray, BooleanBufferBuilder, FixedSizeListArray, Float32Array, Float64Array};
@@ -15,84 +13,12 @@ use arrow::error::ArrowError;
 use bytes::Bytes;
 use parquet::basic::Encoding;
 use parquet::column::page::{Page, PageReader as _};
-use parquet::errors::{ParquetError, Result as ParquetResult};
+use parquet::errors::ParquetError;
 use parquet::file::metadata::{ColumnChunkMetaData, ParquetMetaData};
-use parquet::file::reader::{ChunkReader, Length};
 use parquet::file::serialized_reader::SerializedPageReader;
 
 use super::levels::{self, Run, Shape};
-
-/// A file that many columns read at once, each at its own place.
-#[derive(Clone, Debug)]
-pub(super) struct Shared(Arc<File>);
-
-/// A place in such a file.
-pub(super) struct At(Shared, u64);
-
-impl Shared {
-    pub(super) fn new(file: File) -> Self {
-        Self(Arc::new(file))
-    }
-
-    fn read_at(&self, out: &mut [u8], place: u64) -> io::Result<usize> {
-        #[cfg(unix)]
-        return std::os::unix::fs::FileExt::read_at(&*self.0, out, place);
-        #[cfg(windows)]
-        return std::os::windows::fs::FileExt::seek_read(&*self.0, out, place);
-    }
-
-    fn reader(&self, start: u64) -> At {
-        At(self.clone(), start)
-    }
-
-    /// Whether two ranges of a length hold the same bytes.
-    fn same(&self, a: u64, b: u64, length: u64) -> io::Result<bool> {
-        let (mut a, mut b) = (self.reader(a), self.reader(b));
-        let (mut left, mut blocks) = (length, (vec![0; 1 << 16], vec![0; 1 << 16]));
-        while left > 0 {
-            let n = left.min(1 << 16) as usize;
-            let (x, y) = (&mut blocks.0[..n], &mut blocks.1[..n]);
-            a.read_exact(x)?;
-            b.read_exact(y)?;
-            if x != y {
-                return Ok(false);
-            }
-            left -= n as u64;
-        }
-        Ok(true)
-    }
-}
-
-impl Read for At {
-    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
-        let n = self.0.read_at(out, self.1)?;
-        self.1 += n as u64;
-        Ok(n)
-    }
-}
-
-impl Length for Shared {
-    fn len(&self) -> u64 {
-        self.0.metadata().map_or(0, |m| m.len())
-    }
-}
-
-impl ChunkReader for Shared {
-    type T = BufReader<At>;
-
-    fn get_read(&self, start: u64) -> ParquetResult<Self::T> {
-        Ok(BufReader::with_capacity(256, self.reader(start)))
-    }
-
-    fn get_bytes(&self, start: u64, length: usize) -> ParquetResult<Bytes> {
-        if start.checked_add(length as u64).is_none_or(|end| end > self.len()) {
-            return Err(ParquetError::EOF(format!("{length} bytes at {start} lie beyond the end of the file")));
-        }
-        let mut bytes = vec![0; length];
-        self.reader(start).read_exact(&mut bytes)?;
-        Ok(bytes.into())
-    }
-}
+use super::shared::Shared;
 
 /// What is read from a column of a file: where it is, and what its values are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -398,7 +324,8 @@ impl Out {
             (Self::F64(out), Values::Split) => {
                 let [a, b, c, d, e, f, g, h] = page.split(n);
                 let halves = quads([a, b, c, d]).zip(quads([e, f, g, h]));
-                let whole = |(low, high)| u64::from(u32::from_le_bytes(low)) | u64::from(u32::from_le_bytes(high)) << 32;
+                let whole =
+                    |(low, high)| u64::from(u32::from_le_bytes(low)) | u64::from(u32::from_le_bytes(high)) << 32;
                 out.extend(halves.map(|halves| f64::from_bits(whole(halves))));
             }
             (Self::Bit(out), _) => out.append_packed_range(page.at..page.at + n, &page.values),
