@@ -1,7 +1,7 @@
 """Writing and reading the same rollouts with ccmarl and with Minari, in one run: CPU seconds, wall seconds, bytes, ratios.
 
 usage: stores_beside_minari.py CCMARL WORK_DIR [--episodes N] [--train STEPS] [--bench STORES]
-(needs minari[hdf5,create], gymnasium, numpy, pyarrow; STORES is the program of `cargo bench --bench stores`)
+(needs minari[hdf5,create], gymnasium, numpy, pillow, pyarrow; STORES is the program of `cargo bench --bench stores`)
 
 ccmarl trains a policy for STEPS steps (0: none, the policy is random), records N episodes of it (worlds included) and counts
 all columns of every episode (`inspect`, every digest checked); STORES records and reads the same into replay memory, beside
@@ -15,6 +15,7 @@ import resource
 import shutil
 import subprocess
 import time
+import warnings
 from pathlib import Path
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -27,6 +28,7 @@ args = parser.parse_args()
 args.work.mkdir(parents=True, exist_ok=True)
 os.environ["MINARI_DATASETS_PATH"] = str(args.work / "minari")
 
+warnings.filterwarnings("ignore")  # Minari's, about the data set's description
 import gymnasium as gym
 import minari
 import numpy as np

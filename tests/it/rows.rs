@@ -7,7 +7,7 @@ use ccmarl::schema::{Episode, Layout, Matrix};
 use ccmarl::storage::{self, StorageError};
 use ccmarl::train::replay::Replay;
 
-use super::stores::{FORMS, data_file, layout, message, small, some, write};
+use super::stores::{FORMS, data_file, episode, forge, layout, message, rows_of, small, some, write};
 
 /// The episodes of a store put together from its rows: columns of these agents, without state and rewards per agent.
 pub(crate) fn read(path: &Path, agents: &[usize]) -> Result<Vec<Episode>, StorageError> {
@@ -48,7 +48,8 @@ fn empty(layout: &Layout, agents: &[usize], index: u64) -> Episode {
     let matrices = |width: fn(&ccmarl::schema::AgentSpec) -> usize| {
         agents.iter().map(|&a| Matrix { data: Vec::new(), width: width(&layout.agents[a]) }).collect()
     };
-    let [observations, messages, actions] = [matrices(|a| a.observation), matrices(|a| a.message), matrices(|a| a.action)];
+    let [observations, messages, actions] =
+        [matrices(|a| a.observation), matrices(|a| a.message), matrices(|a| a.action)];
     Episode { index, observations, messages, actions, ..Episode::default() }
 }
 
@@ -83,11 +84,12 @@ fn rows_of_each_form_are_those_of_its_episodes() {
         let mut source = storage::open(&path).unwrap();
         source.next_episode().unwrap();
         let (mut first, mut blocks) = (None, 0);
-        source.read_rows(&[0], &mut |rows| {
-            (first, blocks) = (first.or(Some(rows.episode)), blocks + 1);
-            ControlFlow::Break(())
-        })
-        .unwrap();
+        source
+            .read_rows(&[0], &mut |rows| {
+                (first, blocks) = (first.or(Some(rows.episode)), blocks + 1);
+                ControlFlow::Break(())
+            })
+            .unwrap();
         assert_eq!((first, blocks), (Some(1), 1), "{form}");
     }
 }
@@ -98,7 +100,7 @@ fn a_memory_filled_from_rows_is_the_one_that_episodes_fill() {
     // more rows than a batch has, and rings smaller and larger than the store
     let episodes: Vec<Episode> = (0..700)
         .map(|i| {
-            let mut e = super::stores::episode(&layout, i, 25, false);
+            let mut e = episode(&layout, i, 25, false);
             e.messages.clone_from(&e.observations);
             e
         })
@@ -127,16 +129,16 @@ fn a_memory_filled_from_rows_is_the_one_that_episodes_fill() {
 #[test]
 fn episodes_that_cannot_train_are_refused_by_name_from_rows_too() {
     let layout = layout(&[(true, [2, 2, 1]), (true, [3, 3, 2])], 1);
-    let episode = |index: u64, steps: usize| {
-        let mut e = super::stores::episode(&layout, index, steps, false);
+    let echoing = |index: u64, steps: usize| {
+        let mut e = episode(&layout, index, steps, false);
         e.messages.clone_from(&e.observations);
         e
     };
-    let mut other = [episode(0, 4), episode(1, 4), episode(2, 4)];
+    let mut other = [0, 1, 2].map(|index| echoing(index, 4));
     other[1].messages[1].data[5] += 1.0;
     for (episodes, expected) in [
-        ([episode(0, 4), episode(1, 3), episode(2, 4)], "episode 1 has 3 steps, the trainer needs 4"),
-        ([episode(0, 4), episode(1, 4), episode(2, 6)], "episode 2 has 6 steps, the trainer needs 4"),
+        ([echoing(0, 4), echoing(1, 3), echoing(2, 4)], "episode 1 has 3 steps, the trainer needs 4"),
+        ([echoing(0, 4), echoing(1, 4), echoing(2, 6)], "episode 2 has 6 steps, the trainer needs 4"),
         (other, "episode 1: message.agent_1 is not observation.agent_1"),
     ] {
         for form in FORMS {
@@ -169,5 +171,55 @@ fn no_flipped_bit_of_a_part_gets_into_rows() {
             changed.write_all_at(&[byte], bit as u64 / 8).unwrap();
         }
         read(&path, &[0]).unwrap();
+    }
+}
+
+/// What the writer never writes is refused although every digest is right.
+#[test]
+fn numbers_that_are_not_finite_and_open_diagonals_are_refused() {
+    use arrow::array::{ArrayRef, BooleanArray, FixedSizeListArray, Float32Array};
+    use std::sync::Arc;
+    let layout = small();
+    let directory = tempfile::tempdir().unwrap();
+    let original = directory.path().join("store");
+    write(&original, &layout, &(0..3).map(|i| episode(&layout, i, 2, false)).collect::<Vec<_>>(), false).unwrap();
+    let rows = rows_of(&original);
+    let list = |name: &str| rows.column_by_name(name).unwrap().as_any().downcast_ref::<FixedSizeListArray>().unwrap();
+    let again = |name: &str, values: ArrayRef| -> ArrayRef {
+        let arrow::datatypes::DataType::FixedSizeList(field, width) = list(name).data_type().clone() else { panic!() };
+        Arc::new(FixedSizeListArray::new(field, width, values, list(name).nulls().cloned()))
+    };
+    let mut floats =
+        list("observation.agent_1").values().as_any().downcast_ref::<Float32Array>().unwrap().values().to_vec();
+    floats[4 * 4 + 2] = f32::NAN;
+    let links = list("link").values().as_any().downcast_ref::<BooleanArray>().unwrap();
+    let open: BooleanArray = links.values().iter().enumerate().map(|(i, bit)| Some(bit && i != 8 * 4 + 3)).collect();
+    let mut rewards = vec![Some(0.5); 9];
+    (rewards[2], rewards[5], rewards[8], rewards[6]) = (None, None, None, Some(f32::INFINITY));
+    let cases: [(&str, ArrayRef, &str); 3] = [
+        (
+            "observation.agent_1",
+            again("observation.agent_1", Arc::new(Float32Array::from(floats))),
+            "column observation.agent_1: episode 1 step 1, element 2: found NaN, but a store holds finite numbers only",
+        ),
+        (
+            "link",
+            again("link", Arc::new(open)),
+            "column link: episode 2 step 2: the diagonal must be true, communicator 1 has false",
+        ),
+        (
+            "reward",
+            Arc::new(Float32Array::from(rewards)),
+            "column reward: episode 2 step 0, element 0: found inf, but a store holds finite numbers only",
+        ),
+    ];
+    for (name, column, expected) in cases {
+        let (at, mut columns) = (rows.schema().index_of(name).unwrap(), rows.columns().to_vec());
+        columns[at] = column;
+        let path = directory.path().join(name);
+        forge(&original, &path, &arrow::array::RecordBatch::try_new(rows.schema(), columns).unwrap());
+        let error = message(read(&path, &[0, 1]));
+        assert!(error.contains(expected), "{error}");
+        super::stores::read(&path).unwrap_err();
     }
 }

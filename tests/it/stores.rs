@@ -389,7 +389,7 @@ fn what_is_no_store_says_what_to_give_instead() {
 }
 
 /// Puts a changed manifest over a directory store, with its digest made right again.
-fn reseal(store: &Path, change: impl Fn(&mut Manifest)) {
+pub(crate) fn reseal(store: &Path, change: impl Fn(&mut Manifest)) {
     let path = store.join("manifest.json");
     let mut manifest = Manifest::parse(&fs::read_to_string(&path).unwrap()).unwrap();
     change(&mut manifest);
@@ -437,6 +437,26 @@ fn a_manifest_that_lies_is_an_error() {
     assert!(message(read(&path)).contains("zero episodes"));
 }
 
+/// The rows of the one part of a store.
+pub(crate) fn rows_of(store: &Path) -> arrow::array::RecordBatch {
+    let file = fs::File::open(data_file(store)).unwrap();
+    let reader = parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder::try_new(file).unwrap().build().unwrap();
+    let batches: Vec<_> = reader.map(Result::unwrap).collect();
+    arrow::compute::concat_batches(&batches[0].schema(), &batches).unwrap()
+}
+
+/// A store like `original` with these rows, every digest right.
+pub(crate) fn forge(original: &Path, path: &Path, rows: &arrow::array::RecordBatch) {
+    fs::create_dir(path).unwrap();
+    fs::copy(original.join("manifest.json"), path.join("manifest.json")).unwrap();
+    let file = fs::File::create(data_file(path)).unwrap();
+    let mut writer = parquet::arrow::ArrowWriter::try_new(file, rows.schema(), None).unwrap();
+    writer.write(rows).unwrap();
+    writer.close().unwrap();
+    let (sha256, bytes) = ccmarl::io::sha256_file(&data_file(path)).unwrap();
+    reseal(path, |m| (m.parts[0].sha256, m.parts[0].bytes) = (sha256.clone(), bytes));
+}
+
 #[test]
 fn doubled_missing_or_mistyped_rows_are_errors_even_when_every_digest_is_right() {
     use arrow::array::{Array, RecordBatch};
@@ -445,10 +465,7 @@ fn doubled_missing_or_mistyped_rows_are_errors_even_when_every_digest_is_right()
     let directory = tempfile::tempdir().unwrap();
     let original = directory.path().join("store");
     write(&original, &layout, &(0..3).map(|i| episode(&layout, i, 2, false)).collect::<Vec<_>>(), false).unwrap();
-    let file = fs::File::open(data_file(&original)).unwrap();
-    let reader = parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder::try_new(file).unwrap().build().unwrap();
-    let batches: Vec<RecordBatch> = reader.map(Result::unwrap).collect();
-    let rows = concat_batches(&batches[0].schema(), &batches).unwrap();
+    let rows = rows_of(&original);
     let mistyped = {
         let steps = cast(rows.column(1), &arrow::datatypes::DataType::Int64).unwrap();
         let schema = rows.schema();
@@ -468,14 +485,7 @@ fn doubled_missing_or_mistyped_rows_are_errors_even_when_every_digest_is_right()
         ("headless", rows.slice(1, 8), "expected episode 0 step 0, found episode 0 step 1"),
     ] {
         let path = directory.path().join(name);
-        fs::create_dir(&path).unwrap();
-        fs::copy(original.join("manifest.json"), path.join("manifest.json")).unwrap();
-        let file = fs::File::create(data_file(&path)).unwrap();
-        let mut writer = parquet::arrow::ArrowWriter::try_new(file, batch.schema(), None).unwrap();
-        writer.write(&batch).unwrap();
-        writer.close().unwrap();
-        let (sha256, bytes) = ccmarl::io::sha256_file(&data_file(&path)).unwrap();
-        reseal(&path, |m| (m.parts[0].sha256, m.parts[0].bytes) = (sha256.clone(), bytes));
+        forge(&original, &path, &batch);
         let all = [0, 1, 2];
         for error in [message(read(&path)), message(super::rows::read(&path, &all))] {
             assert!(error.starts_with("damaged: ") && error.contains(expected), "{name}: {error}");

@@ -170,7 +170,7 @@ mod tests {
     use parquet::arrow::ArrowWriter;
     use parquet::arrow::arrow_reader::ArrowReaderOptions;
     use parquet::basic::{Compression, Encoding};
-    use parquet::data_type::{BoolType, FloatType};
+    use parquet::data_type::{BoolType, FloatType, Int32Type, Int64Type};
     use parquet::file::properties::{WriterProperties, WriterVersion};
     use proptest::prelude::*;
 
@@ -213,7 +213,10 @@ mod tests {
                     if a.message == a.observation { e.observations[i].data.clone() } else { draw((t + 1) * a.message) };
                 (e.actions[i].data, e.rewards[i]) = (draw(t * a.action), draw(t));
             }
-            (e.reward, e.link) = (draw(t), draw((t + 1) * 4).iter().map(|&v| v as i64 % 3 > 0).collect());
+            (e.reward, e.link) = (
+                draw(t),
+                draw((t + 1) * layout.communicators().len().pow(2)).iter().map(|&v| v as i64 % 3 > 0).collect(),
+            );
             block.push(layout, &e);
         }
         block.into_batch(&schema(layout)).unwrap()
@@ -347,10 +350,10 @@ mod tests {
                 };
             match name.as_str() {
                 "episode" => {
-                    drop(column.typed::<parquet::data_type::Int64Type>().write_batch(&[0, 0], None, None).unwrap())
+                    column.typed::<Int64Type>().write_batch(&[0, 0], None, None).unwrap();
                 }
                 "step" => {
-                    drop(column.typed::<parquet::data_type::Int32Type>().write_batch(&[0, 1], None, None).unwrap())
+                    column.typed::<Int32Type>().write_batch(&[0, 1], None, None).unwrap();
                 }
                 "observation.a" => floats(&mut column, [&[0, 0], &[1, 1]], 1),
                 "message.a" => floats(&mut column, message, 1),
@@ -362,7 +365,9 @@ mod tests {
                 name if name.starts_with("reward") => {
                     column.typed::<FloatType>().write_batch(&[0.5], Some(&[1, 0]), None).unwrap();
                 }
-                _ => drop(column.typed::<BoolType>().write_batch(&[true, false], None, None).unwrap()),
+                _ => {
+                    column.typed::<BoolType>().write_batch(&[true, false], None, None).unwrap();
+                }
             }
             column.close().unwrap();
         }
