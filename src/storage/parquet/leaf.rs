@@ -101,9 +101,13 @@ pub(super) struct Leaf {
 struct Seen {
     begun: usize,
     count: usize,
-    bytes: Bytes,
+    /// Repetition and definition levels as they stand in the page.
+    levels: [Vec<u8>; 2],
     rows: Option<levels::Rows>,
 }
+
+/// Runs that are kept for the next page at most; ours have two per episode.
+const SEEN_RUNS: usize = 1 << 14;
 
 /// What is left of a page.
 #[derive(Default)]
@@ -209,7 +213,6 @@ impl Leaf {
             }
             Page::DictionaryPage { .. } => return Err("a dictionary where none was announced".to_owned()),
         };
-        let whole = rest.clone();
         let mut inputs = [Bytes::new(), Bytes::new()];
         for ((i, input), there) in inputs.iter_mut().enumerate().zip([shape.list, shape.present > 0]) {
             if there {
@@ -224,8 +227,7 @@ impl Leaf {
         if !shape.nullable && count > kind.most(rest.len()) {
             return Err(format!("{count} values in {} bytes", rest.len()));
         }
-        let bytes = whole.slice(..whole.len() - rest.len());
-        let (runs, values) = self.rows(&inputs, bytes, count)?;
+        let (runs, values) = self.rows(&inputs, count)?;
         let (mut encoding, mut length) = (Values::Plain, values * kind.bits() / 8);
         match (page.encoding(), kind) {
             (Encoding::PLAIN, Kind::Bit) => length = values.div_ceil(8),
@@ -240,11 +242,12 @@ impl Leaf {
         Ok(true)
     }
 
-    /// The rows of a page of `count` levels, which stand in `bytes`.
-    fn rows(&mut self, inputs: &[Bytes; 2], bytes: Bytes, count: usize) -> Result<(Vec<Run>, usize), String> {
+    /// The rows of a page of `count` levels.
+    fn rows(&mut self, inputs: &[Bytes; 2], count: usize) -> Result<(Vec<Run>, usize), String> {
         let seen = &self.seen;
         if let Some(rows) = &seen.rows
-            && (seen.begun, seen.count, &seen.bytes) == (self.begun, count, &bytes)
+            && (seen.begun, seen.count) == (self.begun, count)
+            && seen.levels.iter().zip(inputs).all(|(seen, input)| seen == input)
         {
             self.begun = rows.begun;
             return Ok((rows.runs.clone(), rows.values));
@@ -258,11 +261,12 @@ impl Leaf {
             }
         }
         let rows = levels::rows(shape, [&self.levels[0], &self.levels[1]], count, self.begun)?;
-        let (begun, bytes) = (self.begun, Bytes::copy_from_slice(&bytes));
-        self.begun = rows.begun;
-        let found = (rows.runs.clone(), rows.values);
-        self.seen = Seen { begun, count, bytes, rows: Some(rows) };
-        Ok(found)
+        let begun = std::mem::replace(&mut self.begun, rows.begun);
+        if rows.runs.len() <= SEEN_RUNS {
+            let levels = [inputs[0].to_vec(), inputs[1].to_vec()];
+            self.seen = Seen { begun, count, levels, rows: Some(rows.clone()) };
+        }
+        Ok((rows.runs, rows.values))
     }
 }
 
@@ -310,7 +314,7 @@ impl Opened {
 }
 
 /// Four streams of bytes side by side; written so that the compiler makes vectors of it, which is four times faster.
-fn quads<'a>([a, b, c, d]: [&'a [u8]; 4]) -> impl Iterator<Item = [u8; 4]> + 'a {
+fn quads([a, b, c, d]: [&[u8]; 4]) -> impl Iterator<Item = [u8; 4]> {
     a.iter().zip(b).zip(c.iter().zip(d)).map(|((&a, &b), (&c, &d))| [a, b, c, d])
 }
 

@@ -42,7 +42,7 @@ struct Column {
 enum Reader {
     /// Between row groups.
     None,
-    Own(Leaf),
+    Own(Box<Leaf>),
     Crate(ParquetRecordBatchReader),
     /// The column `twin` has the same pages in this row group.
     Twin,
@@ -69,7 +69,7 @@ impl SideBySide {
             }
             let groups = self.metadata.metadata().row_groups();
             let Some(group) = groups.get(self.group) else { return Ok(false) };
-            self.left = usize::try_from(group.num_rows()).map_err(|_| fault("a row group of less than no rows"))?;
+            self.left = usize::try_from(group.num_rows()).map_err(|e| fault(format!("rows of a row group: {e}")))?;
             let plans: Vec<Option<Plan>> = self.columns.iter().map(|column| column.plan).collect();
             let open = |column: &mut Column| {
                 let of = column.twin.and_then(|twin| plans[twin]);
@@ -128,7 +128,9 @@ impl Column {
         let parquet = metadata.metadata();
         self.reader = Self::guard(self.field.name(), || match (self.plan, of) {
             (Some(plan), Some(of)) if plan.same(&of, file, parquet, group) => Ok(Reader::Twin),
-            (Some(plan), _) => Leaf::open(plan, file, parquet, group).map(Reader::Own).map_err(|e| e.to_string()),
+            (Some(plan), _) => Leaf::open(plan, file, parquet, group)
+                .map(|leaf| Reader::Own(Box::new(leaf)))
+                .map_err(|e| e.to_string()),
             (None, _) => {
                 let builder = ParquetRecordBatchReaderBuilder::new_with_metadata(file.clone(), metadata.clone());
                 let mask = ProjectionMask::roots(builder.parquet_schema(), [self.root]);
@@ -294,7 +296,7 @@ mod tests {
     }
 
     proptest! {
-        #![proptest_config(ProptestConfig { cases: 40, ..ProptestConfig::default() })]
+        #![proptest_config(ProptestConfig { cases: 40, failure_persistence: None, ..ProptestConfig::default() })]
         #[test]
         fn made_up_stores_are_read_as_the_crate_reads_them(
             widths in [1..20_usize, 0..3_usize, 0..3_usize], alike: bool, state in 0..3_usize,
