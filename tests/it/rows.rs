@@ -177,7 +177,7 @@ fn no_flipped_bit_of_a_part_gets_into_rows() {
 /// What the writer never writes is refused although every digest is right.
 #[test]
 fn numbers_that_are_not_finite_and_open_diagonals_are_refused() {
-    use arrow::array::{ArrayRef, BooleanArray, FixedSizeListArray, Float32Array};
+    use arrow::array::{Array as _, ArrayRef, BooleanArray, FixedSizeListArray, Float32Array};
     use std::sync::Arc;
     let layout = small();
     let directory = tempfile::tempdir().unwrap();
