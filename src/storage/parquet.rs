@@ -13,7 +13,7 @@
 //!
 //! # Parameters
 //! None. Floats are split into byte streams under zstd, without a dictionary; row groups hold whole episodes, up to
-//! 131,072 rows; a part holds up to 4,000 episodes or 128 MB of rows in memory.
+//! 131,072 rows or 128 MiB of rows in memory; a part holds up to 4,000 episodes or 128 MiB of rows in memory.
 //!
 //! # When it fails
 //! Until it is finished a store lives in the hidden sibling `.<name>.partial`, with a journal (an Arrow IPC stream)
@@ -40,6 +40,7 @@ mod pages;
 mod pairs;
 mod rows;
 mod salvage;
+mod shared;
 mod side_by_side;
 mod sink;
 mod source;

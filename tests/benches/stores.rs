@@ -40,17 +40,7 @@ fn main() {
         let path = directory.path().join(form);
         let record = || {
             let mut sink = storage::create(&path, &manifest, true).unwrap();
-            recording
-                .record(
-                    &mut *sink,
-                    Options {
-                        threads: option("--threads", "0").parse().unwrap(),
-                        block: option("--block", "0").parse().unwrap(),
-                    },
-                    &mut |_| {},
-                    &AtomicBool::new(false),
-                )
-                .unwrap();
+            recording.record(&mut *sink, Options::default(), &mut |_| {}, &AtomicBool::new(false)).unwrap();
             sink.finish().unwrap();
         };
         record();

@@ -20,6 +20,7 @@ mod record;
 mod recovery;
 mod refusals;
 mod report;
+mod rows;
 mod shaping;
 mod signals;
 mod stats;

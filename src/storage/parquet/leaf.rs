@@ -4,8 +4,6 @@
 //! element, which costs more than all else in reading; ours have a fixed width, so here the levels are only checked.
 
 use std::collections::VecDeque;
-use std::fs::File;
-use std::io::{self, BufReader, Read};
 use std::sync::Arc;
 
 use arrow::array::{ArrayRef, BooleanArray, BooleanBufferBuilder, FixedSizeListArray, Float32Array, Float64Array};
@@ -15,84 +13,12 @@ use arrow::error::ArrowError;
 use bytes::Bytes;
 use parquet::basic::Encoding;
 use parquet::column::page::{Page, PageReader as _};
-use parquet::errors::{ParquetError, Result as ParquetResult};
+use parquet::errors::ParquetError;
 use parquet::file::metadata::{ColumnChunkMetaData, ParquetMetaData};
-use parquet::file::reader::{ChunkReader, Length};
 use parquet::file::serialized_reader::SerializedPageReader;
 
 use super::levels::{self, Run, Shape};
-
-/// A file that many columns read at once, each at its own place.
-#[derive(Clone, Debug)]
-pub(super) struct Shared(Arc<File>);
-
-/// A place in such a file.
-pub(super) struct At(Shared, u64);
-
-impl Shared {
-    pub(super) fn new(file: File) -> Self {
-        Self(Arc::new(file))
-    }
-
-    fn read_at(&self, out: &mut [u8], place: u64) -> io::Result<usize> {
-        #[cfg(unix)]
-        return std::os::unix::fs::FileExt::read_at(&*self.0, out, place);
-        #[cfg(windows)]
-        return std::os::windows::fs::FileExt::seek_read(&*self.0, out, place);
-    }
-
-    fn reader(&self, start: u64) -> At {
-        At(self.clone(), start)
-    }
-
-    /// Whether two ranges of a length hold the same bytes.
-    fn same(&self, a: u64, b: u64, length: u64) -> io::Result<bool> {
-        let (mut a, mut b) = (self.reader(a), self.reader(b));
-        let (mut left, mut blocks) = (length, (vec![0; 1 << 16], vec![0; 1 << 16]));
-        while left > 0 {
-            let n = left.min(1 << 16) as usize;
-            let (x, y) = (&mut blocks.0[..n], &mut blocks.1[..n]);
-            a.read_exact(x)?;
-            b.read_exact(y)?;
-            if x != y {
-                return Ok(false);
-            }
-            left -= n as u64;
-        }
-        Ok(true)
-    }
-}
-
-impl Read for At {
-    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
-        let n = self.0.read_at(out, self.1)?;
-        self.1 += n as u64;
-        Ok(n)
-    }
-}
-
-impl Length for Shared {
-    fn len(&self) -> u64 {
-        self.0.metadata().map_or(0, |m| m.len())
-    }
-}
-
-impl ChunkReader for Shared {
-    type T = BufReader<At>;
-
-    fn get_read(&self, start: u64) -> ParquetResult<Self::T> {
-        Ok(BufReader::with_capacity(256, self.reader(start)))
-    }
-
-    fn get_bytes(&self, start: u64, length: usize) -> ParquetResult<Bytes> {
-        if start.checked_add(length as u64).is_none_or(|end| end > self.len()) {
-            return Err(ParquetError::EOF(format!("{length} bytes at {start} lie beyond the end of the file")));
-        }
-        let mut bytes = vec![0; length];
-        self.reader(start).read_exact(&mut bytes)?;
-        Ok(bytes.into())
-    }
-}
+use super::shared::Shared;
 
 /// What is read from a column of a file: where it is, and what its values are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -175,9 +101,13 @@ pub(super) struct Leaf {
 struct Seen {
     begun: usize,
     count: usize,
-    bytes: Bytes,
+    /// Repetition and definition levels as they stand in the page.
+    levels: [Vec<u8>; 2],
     rows: Option<levels::Rows>,
 }
+
+/// Runs that are kept for the next page at most; ours have two per episode.
+const SEEN_RUNS: usize = 1 << 14;
 
 /// What is left of a page.
 #[derive(Default)]
@@ -283,7 +213,6 @@ impl Leaf {
             }
             Page::DictionaryPage { .. } => return Err("a dictionary where none was announced".to_owned()),
         };
-        let whole = rest.clone();
         let mut inputs = [Bytes::new(), Bytes::new()];
         for ((i, input), there) in inputs.iter_mut().enumerate().zip([shape.list, shape.present > 0]) {
             if there {
@@ -298,8 +227,7 @@ impl Leaf {
         if !shape.nullable && count > kind.most(rest.len()) {
             return Err(format!("{count} values in {} bytes", rest.len()));
         }
-        let bytes = whole.slice(..whole.len() - rest.len());
-        let (runs, values) = self.rows(&inputs, bytes, count)?;
+        let (runs, values) = self.rows(&inputs, count)?;
         let (mut encoding, mut length) = (Values::Plain, values * kind.bits() / 8);
         match (page.encoding(), kind) {
             (Encoding::PLAIN, Kind::Bit) => length = values.div_ceil(8),
@@ -314,11 +242,12 @@ impl Leaf {
         Ok(true)
     }
 
-    /// The rows of a page of `count` levels, which stand in `bytes`.
-    fn rows(&mut self, inputs: &[Bytes; 2], bytes: Bytes, count: usize) -> Result<(Vec<Run>, usize), String> {
+    /// The rows of a page of `count` levels.
+    fn rows(&mut self, inputs: &[Bytes; 2], count: usize) -> Result<(Vec<Run>, usize), String> {
         let seen = &self.seen;
         if let Some(rows) = &seen.rows
-            && (seen.begun, seen.count, &seen.bytes) == (self.begun, count, &bytes)
+            && (seen.begun, seen.count) == (self.begun, count)
+            && seen.levels.iter().zip(inputs).all(|(seen, input)| seen == input)
         {
             self.begun = rows.begun;
             return Ok((rows.runs.clone(), rows.values));
@@ -332,11 +261,12 @@ impl Leaf {
             }
         }
         let rows = levels::rows(shape, [&self.levels[0], &self.levels[1]], count, self.begun)?;
-        let (begun, bytes) = (self.begun, Bytes::copy_from_slice(&bytes));
-        self.begun = rows.begun;
-        let found = (rows.runs.clone(), rows.values);
-        self.seen = Seen { begun, count, bytes, rows: Some(rows) };
-        Ok(found)
+        let begun = std::mem::replace(&mut self.begun, rows.begun);
+        if rows.runs.len() <= SEEN_RUNS {
+            let levels = [inputs[0].to_vec(), inputs[1].to_vec()];
+            self.seen = Seen { begun, count, levels, rows: Some(rows.clone()) };
+        }
+        Ok((rows.runs, rows.values))
     }
 }
 
@@ -384,7 +314,7 @@ impl Opened {
 }
 
 /// Four streams of bytes side by side; written so that the compiler makes vectors of it, which is four times faster.
-fn quads<'a>([a, b, c, d]: [&'a [u8]; 4]) -> impl Iterator<Item = [u8; 4]> + 'a {
+fn quads([a, b, c, d]: [&[u8]; 4]) -> impl Iterator<Item = [u8; 4]> {
     a.iter().zip(b).zip(c.iter().zip(d)).map(|((&a, &b), (&c, &d))| [a, b, c, d])
 }
 

@@ -87,12 +87,12 @@ pub(super) fn rows(shape: Shape, [reps, defs]: [&[u8]; 2], count: usize, begun: 
     let width = shape.width;
     let other = || format!("a list that does not have {width} elements");
     if !shape.nullable {
-        if defs.iter().fold(false, |bad, &def| bad | (def != shape.present)) {
+        if defs.iter().fold(0, |other, def| other | (def ^ shape.present)) != 0 {
             return Err("a null where none may be".to_owned());
         }
         // the end of the row at hand, then row by row
         let (head, whole) = reps.split_at(reps.len().min((width - begun) % width));
-        let fits = |row: &[u8]| row[0] == 0 && row[1..].iter().fold(true, |fits, &rep| fits & (rep == 1));
+        let fits = |row: &[u8]| row[0] == 0 && row[1..].iter().fold(1, |all, rep| all & rep) == 1;
         if head.contains(&0) || !whole.chunks(width).all(fits) {
             return Err(other());
         }
