@@ -38,6 +38,7 @@ const LINES: Lines = Lines {
     x_digits: Some(1),
     diagonal: true,
     marks: true,
+    log: false,
 };
 
 fn render(data: &Data, target: Target<'_>) -> Result<(), FigureError> {
