@@ -201,7 +201,7 @@ impl Fitted {
                 }
                 link
             }
-            Self::Distance(range) => resolved("distance", &json!({"threshold": range.range / unit, "unit": unit})),
+            Self::Distance(range) => resolved("distance", &json!({"threshold": range.reach / unit, "unit": unit})),
             Self::Learned(classifier) => resolved("learned", classifier),
         }
     }
@@ -232,7 +232,7 @@ impl Fitted {
             Self::Distance(range) => {
                 let scaled = |name: &str, by: f64| Parameter {
                     name: name.to_owned(),
-                    value: range.range / by,
+                    value: range.reach / by,
                     low: range.low / by,
                     high: range.high / by,
                     messages: None,

@@ -154,7 +154,7 @@ impl Observations {
             for row in 0..rows {
                 let state = &episode.state[row * width..(row + 1) * width];
                 for at in &bodies.0 {
-                    if let Some(&bad) = at.iter().flatten().find(|&&i| !(state[i].abs() <= 1e9)) {
+                    if let Some(&bad) = at.iter().flatten().find(|&&i| state[i].is_nan() || state[i].abs() > 1e9) {
                         let (field, path) = (self.source.state_fields[bad].clone(), self.source.path.clone());
                         let value = state[bad];
                         return Err(ChannelError::Value { field, episode: episode.index, step: row, value, path });

@@ -38,7 +38,7 @@ pub(super) struct Args {
     /// What to fit
     #[arg(long, default_value = "auto", value_parser = PossibleValuesParser::new(MODELS.iter().map(|(name, _)| *name)))]
     model: String,
-    /// File to write, for --link file:FILE
+    /// File to write, for `--link file:FILE`
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     out: PathBuf,
     /// Seed of the held-out episodes and of training

@@ -14,7 +14,7 @@
 //! No curve has a point; a value is not finite.
 //!
 //! # Reference
-//! DeGroot and Fienberg 1983; Guo et al. 2017.
+//! Guo et al. 2017; reliability diagrams are older (Murphy and Winkler 1977).
 //!
 //! # Differences from the reference implementation
 //! None.

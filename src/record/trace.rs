@@ -239,11 +239,15 @@ fn expected(column: &str, row: usize, wanted: &str, found: &str, path: &Path) ->
 mod tests {
     use super::*;
 
+    /// Reads the text as a file `t.csv`.
     fn read(text: &str) -> Result<Trace, String> {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("t.csv");
-        crate::io::write_atomic(&path, text.as_bytes()).unwrap();
-        read_trace(&path).map_err(|e| e.to_string().replace(path.to_str().unwrap(), "t.csv"))
+        let read = || -> std::io::Result<_> {
+            let dir = tempfile::tempdir()?;
+            let path = dir.path().join("t.csv");
+            std::fs::File::create(&path).and_then(|mut file| std::io::Write::write_all(&mut file, text.as_bytes()))?;
+            Ok(read_trace(&path).map_err(|e| e.to_string().replace(path.to_string_lossy().as_ref(), "t.csv")))
+        };
+        read().map_err(|e| e.to_string())?
     }
 
     const HEAD: &str = "episode,step,sender,receiver,delivered\n";

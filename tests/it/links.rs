@@ -1,5 +1,6 @@
 //! Links: contract over the registry, purity, realised loss of recorded episodes.
 
+use std::fmt::Write as _;
 use std::path::Path;
 
 use ccmarl::link::{Body, FEATURES, LINKS, Link, Setting, build};
@@ -26,7 +27,7 @@ fn files() -> tempfile::TempDir {
     for (episode, step) in (0..3).flat_map(|e| (0..26).map(move |t| (e, t))) {
         for (s, r) in (0..AGENTS * AGENTS).map(|c| (c / AGENTS, c % AGENTS)).filter(|(s, r)| s != r) {
             let bit = u8::from((7 * episode + 3 * step + 5 * s + r) % 4 > 0);
-            rows.push_str(&format!("{episode},{step},{s},{r},{bit}\n"));
+            writeln!(rows, "{episode},{step},{s},{r},{bit}").unwrap();
         }
     }
     std::fs::write(dir.path().join("trace.csv"), rows).unwrap();
