@@ -166,7 +166,9 @@ pub(super) fn choose_order(runs: &[Runs], seeds: &Seeds) -> Order {
         rest.combine(&Runs::sum(held.iter().map(|&e| &runs[e])), |a, b| a - b);
         for (states, likelihood) in likelihoods.iter_mut().enumerate() {
             let chain = Chain::fit(&rest, states + 1);
-            held.iter().for_each(|&e| likelihood[e] = chain.log_likelihood(&runs[e]));
+            for &e in &held {
+                likelihood[e] = chain.log_likelihood(&runs[e]);
+            }
         }
     }
     let messages: Vec<u64> = runs.iter().map(|r| r.total()[0]).collect();

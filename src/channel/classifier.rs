@@ -112,7 +112,9 @@ fn descend(mlp: &Mlp, train: &Set, held: &Set, seeds: &Seeds, progress: &dyn Fn(
         let order = permutation(&mut seeds.indexed_stream("epoch", epoch as u64), train.lost.len());
         for batch in order.chunks(BATCH) {
             x.clear();
-            batch.iter().for_each(|&m| x.extend_from_slice(&train.x[m * FEATURES.len()..(m + 1) * FEATURES.len()]));
+            for &m in batch {
+                x.extend_from_slice(&train.x[m * FEATURES.len()..(m + 1) * FEATURES.len()]);
+            }
             let logits = mlp.forward(&params, &x, batch.len(), &mut tape);
             grad.clear();
             let slope = |(&m, &logit): (&usize, &f32)| log_loss(f64::from(logit), train.lost[m]).1 / batch.len() as f64;

@@ -20,7 +20,7 @@ impl Fit {
         Data {
             title: format!("Reliability of the fitted link: {}", self.model),
             subtitle: format!(
-                "{} messages of {} held-out episodes, calibration error {:.4}; whiskers: 95 %, together",
+                "{} messages of {} held-out episodes, calibration error {:.4}; whiskers: exact 95 %, all together",
                 score.messages, score.episodes, score.calibration_error.value
             ),
             unit: "share of lost messages".to_owned(),
@@ -32,8 +32,9 @@ impl Fit {
 }
 
 impl LinkStatistics {
-    /// The figures of what a link did: loss by step, burst lengths, loss by distance. `title` names the link.
-    pub fn figures(&self, title: &str) -> Data {
+    /// The figures of what a link did: loss by step, burst lengths, loss by distance. `title` names the link, `unit` what the
+    /// figure to be drawn shows.
+    pub fn figures(&self, title: &str, unit: &str) -> Data {
         let total = self.total();
         let [messages, lost] = total.total();
         let mut named = vec![(ALL.to_owned(), &total)];
@@ -50,8 +51,8 @@ impl LinkStatistics {
         };
         Data {
             title: title.to_owned(),
-            subtitle: format!("{lost} of {messages} messages lost; band: 95 % of each point, messages independent"),
-            unit: "share".to_owned(),
+            subtitle: format!("{lost} of {messages} messages lost; around all links: exact 95 % of each point alone"),
+            unit: unit.to_owned(),
             series: named.iter().map(|(series, _)| series.clone()).collect(),
             loss_by_step: curves(|o| shares(&o.steps, 0.0, 1.0)),
             bursts: curves(|o| {

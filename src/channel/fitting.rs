@@ -201,7 +201,7 @@ impl Fitted {
                 }
                 link
             }
-            Self::Distance(range) => resolved("distance", &json!({"threshold": range.range / unit, "unit": unit})),
+            Self::Distance(range) => resolved("distance", &json!({"threshold": range.reach / unit, "unit": unit})),
             Self::Learned(classifier) => resolved("learned", classifier),
         }
     }
@@ -232,7 +232,7 @@ impl Fitted {
             Self::Distance(range) => {
                 let scaled = |name: &str, by: f64| Parameter {
                     name: name.to_owned(),
-                    value: range.range / by,
+                    value: range.reach / by,
                     low: range.low / by,
                     high: range.high / by,
                     messages: None,
@@ -249,6 +249,10 @@ impl Fitted {
         let (used, episodes) = (observations.episodes() as u64, observations.source.episodes);
         if used < episodes {
             notes.push(format!("the first {used} of {episodes} episodes were used: more do not fit in memory"));
+        }
+        if observations.stride > 1 {
+            let (used, stride) = (observations.links(), observations.stride);
+            notes.push(format!("{used} directed links were used, one of {stride}: more do not fit in memory"));
         }
         if let Self::Dropout(_) | Self::Markov(_) = self {
             let differ = differ(observations, matches!(self, Self::Markov(_)));
@@ -321,8 +325,8 @@ struct Candidate {
 /// is done.
 ///
 /// # Errors
-/// [`ChannelError::Registry`] for a model that there is not, [`ChannelError::NoPositions`] and [`ChannelError::NoChain`]
-/// when it was asked for by name.
+/// [`ChannelError::Registry`] for a model that there is not, those of [`Observations::check`],
+/// [`ChannelError::NoPositions`] and [`ChannelError::NoChain`] when it was asked for by name.
 pub fn fit(
     observations: &Observations,
     model: &str,
@@ -334,6 +338,7 @@ pub fn fit(
         let hint = did_you_mean(model, known);
         return Err(RegistryError::Unknown { kind: "model", name: model.to_owned(), hint }.into());
     };
+    observations.check()?;
     let seeds = Seeds::new(seed).child("fit-link");
     let parts = Parts::of(observations.episodes(), &seeds);
     let seen = parts.seen();

@@ -77,6 +77,16 @@ pub enum ChannelError {
         /// Where.
         path: PathBuf,
     },
+    /// Too much to hold.
+    #[error("{needed} episodes of one link hold more than {messages} messages: cut them into shorter ones: {}", path.display())]
+    TooLong {
+        /// Fewest episodes.
+        needed: usize,
+        /// Most messages.
+        messages: usize,
+        /// Where.
+        path: PathBuf,
+    },
     /// Models of the state on data without states.
     #[error("{model} needs the agents' positions, and {reason}: fit dropout or markov, or give a rollout store: {}", path.display())]
     NoPositions {

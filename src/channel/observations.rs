@@ -14,6 +14,9 @@ use crate::storage::EpisodeSource;
 /// Most messages that are held in memory; a fit uses the first whole episodes up to here.
 const MAX_MESSAGES: usize = 4_000_000;
 
+/// Episodes that shall fit in there: where there are too many links for it, every k-th one is used.
+const WANTED_EPISODES: usize = 50;
+
 /// Where observations come from: what a fitted file says about its data.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct DataSource {
@@ -48,6 +51,8 @@ pub struct Observations {
     pub features: Result<Vec<[f64; FEATURES.len()]>, String>,
     /// Sequence q = episode · links + link is messages `starts[q]..starts[q + 1]`.
     starts: Vec<usize>,
+    /// Every how many-th directed link is used.
+    pub(super) stride: usize,
 }
 
 impl Observations {
@@ -62,7 +67,8 @@ impl Observations {
         } else {
             Self::of_source(crate::storage::open(path)?.as_mut(), path)?
         };
-        observations.check()
+        observations.check()?;
+        Ok(observations)
     }
 
     /// The messages of a store.
@@ -79,7 +85,7 @@ impl Observations {
             out.features = Err(reason.clone());
         }
         while let Some(episode) = source.next_episode()? {
-            if out.lost.len() + episode.rows() * out.links() > MAX_MESSAGES && out.source.used > 0 {
+            if !out.takes(episode.rows()) {
                 break;
             }
             out.push(&episode, bodies.as_ref().ok())?;
@@ -100,14 +106,13 @@ impl Observations {
         let mut out = Self::empty(&layout, path);
         out.agents.clone_from(&trace.agents);
         out.features = Err("a table of link bits has none".to_owned());
-        let links = trace.links();
         for episode in 0..trace.episodes() {
             let rows = trace.starts[episode]..trace.starts[episode + 1];
-            if out.lost.len() + rows.len() * links > MAX_MESSAGES && out.source.used > 0 {
+            if !out.takes(rows.len()) {
                 break;
             }
-            for link in 0..links {
-                out.lost.extend(rows.clone().map(|row| !trace.bits[row * links + link]));
+            for link in (0..trace.links()).step_by(out.stride) {
+                out.lost.extend(rows.clone().map(|row| !trace.bits[row * trace.links() + link]));
                 out.starts.push(out.lost.len());
             }
             out.source.used += 1;
@@ -129,7 +134,16 @@ impl Observations {
             state_fields: layout.state_fields.clone(),
             distance_unit: 1.0,
         };
-        Self { source, agents, body_fields, lost: Vec::new(), features: Ok(Vec::new()), starts: vec![0] }
+        Self { source, agents, body_fields, lost: Vec::new(), features: Ok(Vec::new()), starts: vec![0], stride: 1 }
+    }
+
+    /// Whether another episode of so many rows fits; the first one says how many links are used.
+    fn takes(&mut self, rows: usize) -> bool {
+        if self.source.used == 0 {
+            let links = self.agents.len() * self.agents.len().saturating_sub(1);
+            self.stride = (links * rows * WANTED_EPISODES).div_ceil(MAX_MESSAGES).clamp(1, links.max(1));
+        }
+        self.lost.len() + rows * self.links() <= MAX_MESSAGES
     }
 
     /// Appends an episode.
@@ -140,7 +154,7 @@ impl Observations {
             for row in 0..rows {
                 let state = &episode.state[row * width..(row + 1) * width];
                 for at in &bodies.0 {
-                    if let Some(&bad) = at.iter().flatten().find(|&&i| !(state[i].abs() <= 1e9)) {
+                    if let Some(&bad) = at.iter().flatten().find(|&&i| state[i].is_nan() || state[i].abs() > 1e9) {
                         let (field, path) = (self.source.state_fields[bad].clone(), self.source.path.clone());
                         let value = state[bad];
                         return Err(ChannelError::Value { field, episode: episode.index, step: row, value, path });
@@ -149,7 +163,8 @@ impl Observations {
                 }
             }
         }
-        for (s, r) in (0..n * n).map(|cell| (cell / n, cell % n)).filter(|(s, r)| s != r) {
+        let pairs = (0..n * n).map(|cell| (cell / n, cell % n)).filter(|(s, r)| s != r);
+        for (s, r) in pairs.step_by(self.stride) {
             self.lost.extend((0..rows).map(|row| !episode.delivered(n, row, s, r)));
             self.starts.push(self.lost.len());
             if let (Ok(all), false) = (&mut self.features, states.is_empty()) {
@@ -161,20 +176,27 @@ impl Observations {
     }
 
     /// Refuses what no model can be fitted to.
-    fn check(self) -> Result<Self, ChannelError> {
+    ///
+    /// # Errors
+    /// [`ChannelError::NoLinks`], [`ChannelError::OneClass`], [`ChannelError::TooFewEpisodes`],
+    /// [`ChannelError::TooLong`].
+    pub fn check(&self) -> Result<(), ChannelError> {
         let path = self.source.path.clone();
         if self.agents.len() < 2 {
             return Err(ChannelError::NoLinks { found: self.agents.len(), path });
         }
         let (messages, lost) = (self.messages(), self.lost.iter().filter(|&&lost| lost).count());
-        if lost == 0 || lost == messages {
+        if messages > 0 && (lost == 0 || lost == messages) {
             let (class, link) = if lost == 0 { ("delivered", "perfect") } else { ("lost", "none") };
             return Err(ChannelError::OneClass { messages, class, link, path });
+        }
+        if self.episodes() < super::LEAST_EPISODES && (self.episodes() as u64) < self.source.episodes {
+            return Err(ChannelError::TooLong { needed: super::LEAST_EPISODES, messages: MAX_MESSAGES, path });
         }
         if self.episodes() < super::LEAST_EPISODES {
             return Err(ChannelError::TooFewEpisodes { needed: super::LEAST_EPISODES, found: self.episodes(), path });
         }
-        Ok(self)
+        Ok(())
     }
 
     /// Episodes that are used.
@@ -187,9 +209,9 @@ impl Observations {
         self.lost.len()
     }
 
-    /// Directed links.
+    /// Directed links that are used.
     pub fn links(&self) -> usize {
-        self.agents.len() * self.agents.len().saturating_sub(1)
+        (self.agents.len() * self.agents.len().saturating_sub(1)).div_ceil(self.stride)
     }
 
     /// The sequences of an episode, one per directed link, as ranges of messages.
@@ -201,18 +223,6 @@ impl Observations {
     /// The messages of an episode.
     pub fn episode(&self, episode: usize) -> std::ops::Range<usize> {
         self.starts[episode * self.links()]..self.starts[(episode + 1) * self.links()]
-    }
-
-    /// Messages and lost ones per directed link.
-    pub fn by_link(&self) -> Vec<[u64; 2]> {
-        let mut counts = vec![[0; 2]; self.links()];
-        for episode in 0..self.episodes() {
-            for (count, sequence) in counts.iter_mut().zip(self.sequences(episode)) {
-                count[0] += sequence.len() as u64;
-                count[1] += self.lost[sequence].iter().filter(|&&lost| lost).count() as u64;
-            }
-        }
-        counts
     }
 
     /// The relative states, for a model that needs them.
@@ -257,12 +267,36 @@ mod tests {
         let observations = Observations::of_trace(&trace(&[1, 0, 0, 1, 1, 1], &[0, 2, 3]), Path::new("t.csv"));
         assert_eq!(observations.lost, [false, true, true, false, false, false]);
         assert_eq!(observations.sequences(0).collect::<Vec<_>>(), [0..2, 2..4]);
-        assert_eq!((observations.episode(1), observations.by_link()), (4..6, vec![[3, 1], [3, 1]]));
+        assert_eq!(observations.episode(1), 4..6);
         let error = observations.states("distance").unwrap_err().to_string();
         assert_eq!(
             error,
             "distance needs the agents' positions, and a table of link bits has none: fit dropout or markov, or give a rollout store: t.csv"
         );
+    }
+
+    #[test]
+    fn of_many_links_some_are_used_and_of_long_episodes_none() {
+        let names = |n: usize| (0..n).map(|i| i.to_string()).collect();
+        let trace = |n: usize, rows: usize, episodes: usize| Trace {
+            agents: names(n),
+            starts: (0..=episodes).map(|e| e * rows).collect(),
+            bits: (0..n * (n - 1) * rows * episodes).map(|i| i % 7 > 0).collect(),
+            sha256: String::new(),
+        };
+        // 9900 links of 20 rows are 198 000 messages an episode: every third link lets 50 episodes fit
+        let many = Observations::of_trace(&trace(100, 20, 12), Path::new("t"));
+        assert_eq!((many.stride, many.links(), many.episodes(), many.messages()), (3, 3300, 12, 12 * 20 * 3300));
+        assert_eq!(many.sequences(1).nth(1), Some(20 * 3301..20 * 3302));
+        assert_eq!(
+            many.lost[20 * 3301],
+            !trace(100, 20, 12).bits[20 * 9900 + 3],
+            "the fourth link of the second episode"
+        );
+        let long = Observations::of_trace(&trace(2, 500_000, 11), Path::new("t"));
+        assert_eq!((long.stride, long.episodes()), (2, 8));
+        let error = long.check().unwrap_err().to_string();
+        assert!(error.starts_with("10 episodes of one link hold more than 4000000 messages"), "{error}");
     }
 
     #[test]

@@ -125,7 +125,7 @@ impl Score {
         };
         let total = sum(&mut (0..tallies.len()));
         let mut stream = seeds.stream("score");
-        let mut resampled = vec![Vec::with_capacity(RESAMPLES); 4];
+        let mut resampled = vec![Vec::new(); 4];
         for _ in 0..RESAMPLES {
             let figures = sum(&mut (0..tallies.len()).map(|_| below(&mut stream, tallies.len()))).figures();
             for (all, figure) in resampled.iter_mut().zip(figures) {

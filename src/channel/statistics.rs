@@ -128,6 +128,7 @@ impl LinkStatistics {
     }
 
     /// Adds the counts of other episodes of the same team.
+    #[must_use]
     pub fn merge(mut self, other: &Self) -> Self {
         self.observed.iter_mut().zip(&other.observed).for_each(|(own, others)| own.add(others));
         self
@@ -143,10 +144,10 @@ impl LinkStatistics {
     /// One line per link and step, burst length or bin of distance: `sender,receiver,kind,at,messages,lost`; of a burst
     /// length `at`, `lost` is the number of bursts, and of a bin `at` its lower end, world units.
     pub fn csv(&self) -> String {
-        let mut out = "sender,receiver,kind,at,messages,lost\n".to_owned();
+        let mut lines = vec!["sender,receiver,kind,at,messages,lost".to_owned()];
         for ((sender, receiver), observed) in self.links.iter().zip(&self.observed) {
             let mut line = |kind: &str, at: String, messages: String, lost: u64| {
-                out.push_str(&format!("{sender},{receiver},{kind},{at},{messages},{lost}\n"));
+                lines.push(format!("{sender},{receiver},{kind},{at},{messages},{lost}"));
             };
             for (step, [messages, lost]) in observed.steps.iter().enumerate() {
                 line("step", step.to_string(), messages.to_string(), *lost);
@@ -158,7 +159,7 @@ impl LinkStatistics {
                 line("distance", format!("{:.1}", bin as f64 * BIN_WIDTH), messages.to_string(), *lost);
             }
         }
-        out
+        lines.join("\n") + "\n"
     }
 }
 
@@ -185,7 +186,7 @@ mod tests {
         let link = bits.iter().flat_map(|&b| [true, b == 1, true, true]).collect();
         let state = (0..=steps).flat_map(|t| [0.0, 0.0, 0.0, t as f64]).collect();
         let mut statistics = LinkStatistics::new(&layout);
-        statistics.add(&Episode { steps, link, state, ..Episode::default() });
+        statistics.add(&Episode { steps, state, link, ..Episode::default() });
         statistics
     }
 

@@ -6,7 +6,7 @@ use crate::link::FEATURES;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Range {
     /// World units: the middle of the gap that splits the classes best.
-    pub(super) range: f64,
+    pub(super) reach: f64,
     /// Lower end of the interval. Without contradictions the largest delivered distance: no hard range below it can be.
     pub(super) low: f64,
     /// Upper end. Without contradictions the smallest lost distance: no hard range there or above can be.
@@ -52,13 +52,13 @@ pub(super) fn fit(mut messages: Vec<(f64, bool)>) -> Range {
     let low = cuts.iter().filter(possible).map(|c| c.0).fold(f64::INFINITY, f64::min);
     let high = cuts.iter().filter(possible).map(|c| c.1).fold(0.0, f64::max);
     let error = (fewest as f64 + 0.5) / (n + 1) as f64;
-    Range { range: 0.5 * (middle.0 + middle.1), low, high, contradictions: fewest, error: error.min(0.5) }
+    Range { reach: 0.5 * (middle.0 + middle.1), low, high, contradictions: fewest, error: error.min(0.5) }
 }
 
 impl Range {
     /// Predicted loss probability of a message.
     pub(super) fn predict(&self, features: &[f64; FEATURES.len()]) -> f64 {
-        if features[2] <= self.range { self.error } else { 1.0 - self.error }
+        if features[2] <= self.reach { self.error } else { 1.0 - self.error }
     }
 }
 
@@ -69,7 +69,7 @@ mod tests {
     #[test]
     fn without_contradictions_the_interval_is_the_gap() {
         let found = fit(vec![(0.7, false), (0.9, true), (0.3, false), (1.5, true), (0.3, false), (0.9, true)]);
-        assert_eq!((found.low, found.high, found.range, found.contradictions), (0.7, 0.9, 0.8, 0));
+        assert_eq!((found.low, found.high, found.reach, found.contradictions), (0.7, 0.9, 0.8, 0));
         assert_eq!(found.error, 0.5 / 7.0);
         assert_eq!(found.predict(&[0.0, 0.0, 0.8, 0.0, 0.0]), found.error);
         assert_eq!(found.predict(&[0.0, 0.0, 0.81, 0.0, 0.0]), 1.0 - found.error);
@@ -83,7 +83,7 @@ mod tests {
         // the message at 0.5 was lost: a range just below it contradicts one message fewer
         assert_eq!(found.contradictions, 7);
         assert!(found.low <= 0.5 && 0.5 <= found.high && found.high - found.low < 0.05, "{found:?}");
-        assert!((found.range - 0.4975).abs() < 1e-9, "{found:?}");
+        assert!((found.reach - 0.4975).abs() < 1e-9, "{found:?}");
     }
 
     #[test]

@@ -21,11 +21,12 @@ Examples:
   ccmarl fit-link measured.csv --model markov --out wifi.json
   ccmarl train --scenario simple_spread --prior file:wifi.json --out runs/matched
 
-STORE is what `ccmarl record` wrote, or a CSV or Parquet table with the columns episode, step, sender, receiver,
-delivered. Models are compared by their likelihood on 30 % of the episodes, which they were not fitted on; auto takes
-the simplest one that none beats by three standard errors. All intervals of a fit hold together at 95 %: exact for
-shares of messages and for a threshold that nothing contradicts; episodes resampled for the held-out figures.
-Beside FILE it writes FILE's reliability figure (.reliability.svg).";
+STORE is what `ccmarl record` wrote, or a CSV or Parquet table with the columns episode, step,
+sender, receiver, delivered. Models are compared by their likelihood on 30 % of the episodes, which
+they were not fitted on: auto takes the simplest one that none beats by three standard errors, and
+fits it to all episodes (a classifier stays as it was scored). All intervals of a fit hold together
+at 95 %: exact for shares of messages and for a threshold that nothing contradicts; episodes
+resampled for the held-out figures. A reliability figure is written beside FILE (.reliability.svg).";
 
 /// Arguments of `fit-link`.
 #[derive(Debug, clap::Args)]
@@ -37,7 +38,7 @@ pub(super) struct Args {
     /// What to fit
     #[arg(long, default_value = "auto", value_parser = PossibleValuesParser::new(MODELS.iter().map(|(name, _)| *name)))]
     model: String,
-    /// File to write, for --link file:FILE
+    /// File to write, for `--link file:FILE`
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     out: PathBuf,
     /// Seed of the held-out episodes and of training

@@ -21,9 +21,9 @@ Examples:
   ccmarl link simulate file:link.json --scenario simple_tag --out reports/link
   ccmarl link simulate '{\"name\": \"markov\", \"matrix\": [[0.9, 0.1], [0.6, 0.4]]}'
 
-LINK is written as for --link of `ccmarl record`: name, name:value, or a JSON table. Agents move as the policy says, which
-matters for links that depend on distance. --out takes the counts of every directed link and step (statistics.csv) and
-the figures.";
+LINK is written as for --link of `ccmarl record`: name, name:value, or a JSON table. Agents move as
+the policy says, which matters for links that depend on distance. --out takes the counts of every
+directed link and step (statistics.csv) and the figures.";
 
 /// Arguments of `link`.
 #[derive(Debug, clap::Args)]
@@ -66,11 +66,11 @@ struct SimulateArgs {
     format: Format,
 }
 
-/// Names of what `--out` takes, and of the figure behind each picture.
-const PICTURES: [(&str, &str); 3] = [
-    ("loss-by-step.svg", "loss-by-step"),
-    ("burst-lengths.svg", "burst-lengths"),
-    ("loss-by-distance.svg", "loss-by-distance"),
+/// What `--out` takes: a file, its figure, and what that shows.
+const PICTURES: [(&str, &str, &str); 3] = [
+    ("loss-by-step.svg", "loss-by-step", "share of lost messages"),
+    ("burst-lengths.svg", "burst-lengths", "share of bursts"),
+    ("loss-by-distance.svg", "loss-by-distance", "share of lost messages"),
 ];
 const TABLE: &str = "statistics.csv";
 
@@ -82,7 +82,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
 
 fn simulate(args: &SimulateArgs) -> anyhow::Result<Outcome> {
     if let Some(out) = &args.out {
-        for name in PICTURES.iter().map(|(name, _)| *name).chain([TABLE]) {
+        for name in PICTURES.iter().map(|(name, ..)| *name).chain([TABLE]) {
             io::refuse_existing(&out.join(name), args.force).map_err(Error::from)?;
         }
     }
@@ -125,8 +125,8 @@ fn simulate(args: &SimulateArgs) -> anyhow::Result<Outcome> {
 }
 
 fn write(counted: &LinkStatistics, title: &str, out: &Path) -> anyhow::Result<()> {
-    let data = counted.figures(title);
-    for (name, figure) in PICTURES {
+    for (name, figure, unit) in PICTURES {
+        let data = counted.figures(title, unit);
         let drawn = figure::svg(find("figure", FIGURES, figure).map_err(Error::from)?, &data);
         match drawn {
             Ok(svg) => io::write_atomic(&out.join(name), svg.as_bytes()).map_err(Error::from)?,

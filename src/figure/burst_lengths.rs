@@ -5,7 +5,7 @@
 //! One line per directed link, and all together with their interval; a burst that the episode's end cuts is as long as it was.
 //!
 //! # Shapes and units
-//! x: losses in a row; y: `Data::unit`. 1600 × 900 units.
+//! x: losses in a row; y: `Data::unit`, logarithmic. 1600 × 900 units.
 //!
 //! # Parameters
 //! None; it reads `bursts`, `series`, `references`.
@@ -38,6 +38,7 @@ const LINES: Lines = Lines {
     x_digits: Some(0),
     diagonal: false,
     marks: true,
+    log: true,
 };
 
 fn render(data: &Data, target: Target<'_>) -> Result<(), FigureError> {

@@ -98,14 +98,7 @@ impl Draw for Figure<'_> {
             let Some((_, color)) = self.colors.iter().find(|(s, _)| *s == curve.series) else {
                 continue;
             };
-            let band: Vec<_> = curve.points.iter().filter_map(|p| p.band.map(|b| (p.step, b))).collect();
-            if !band.is_empty() {
-                let edge = band.iter().map(|&(x, (low, _))| (x, low));
-                let outline = edge.chain(band.iter().rev().map(|&(x, (_, high))| (x, high))).collect::<Vec<_>>();
-                chart.draw_series(std::iter::once(Polygon::new(outline, color.mix(0.18))))?;
-            }
-            let line = curve.points.iter().map(|p| (p.step, p.value));
-            chart.draw_series(LineSeries::new(line, color.stroke_width(if band.is_empty() { 4 } else { 6 })))?;
+            style::draw_curve(&mut chart, curve, *color, false)?;
         }
         Ok(())
     }

@@ -38,6 +38,7 @@ const LINES: Lines = Lines {
     x_digits: Some(0),
     diagonal: false,
     marks: false,
+    log: false,
 };
 
 fn render(data: &Data, target: Target<'_>) -> Result<(), FigureError> {

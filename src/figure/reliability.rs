@@ -14,7 +14,7 @@
 //! No curve has a point; a value is not finite.
 //!
 //! # Reference
-//! DeGroot and Fienberg 1983; Guo et al. 2017.
+//! Guo et al. 2017; reliability diagrams are older (Murphy and Winkler 1977).
 //!
 //! # Differences from the reference implementation
 //! None.
@@ -38,6 +38,7 @@ const LINES: Lines = Lines {
     x_digits: Some(1),
     diagonal: true,
     marks: true,
+    log: false,
 };
 
 fn render(data: &Data, target: Target<'_>) -> Result<(), FigureError> {

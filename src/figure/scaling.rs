@@ -85,12 +85,6 @@ fn logarithms(curve: &Curve) -> Result<Vec<(f64, f64)>, FigureError> {
     Ok(points)
 }
 
-/// A power of ten for a tick.
-fn power(exponent: f64) -> String {
-    let value = 10.0_f64.powf(exponent);
-    style::number(value, (1.0 - exponent.floor()).clamp(0.0, 6.0) as usize)
-}
-
 impl Draw for Figure<'_> {
     fn size(&self) -> (u32, u32) {
         (1600, 900)
@@ -106,7 +100,7 @@ impl Draw for Figure<'_> {
             .x_label_area_size(88)
             .y_label_area_size(160)
             .build_cartesian_2d(self.sizes.clone(), self.costs.clone())?;
-        let label = |exponent: &f64| power(*exponent);
+        let label = |exponent: &f64| style::power(*exponent);
         style::mesh_with(&mut chart, (&self.data.unit, &label), (Some("agents"), &label))?;
         for (_, color, points) in &self.lines {
             chart.draw_series(LineSeries::new(points.iter().copied(), color.stroke_width(5)))?;
@@ -127,6 +121,6 @@ mod tests {
         let curve = Curve { series: "spread".to_owned(), points: points.to_vec() };
         let data = Data { series: vec!["spread".to_owned()], costs: vec![curve], ..Data::default() };
         assert!(svg(&ENTRY, &data).unwrap().contains("spread: exponent 2.00"));
-        assert_eq!([-2.0, 0.0, 1.0, 2.5].map(power), ["0.010", "1.0", "10", "316"]);
+        assert_eq!([-2.0, 0.0, 1.0, 2.5].map(style::power), ["0.010", "1.0", "10", "316"]);
     }
 }

@@ -9,7 +9,7 @@ use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
-use crate::figure::{FigureError, Reference, Target};
+use crate::figure::{Curve, FigureError, Reference, Target};
 use crate::io::printable;
 
 /// An area of units that figures draw on.
@@ -105,6 +105,12 @@ pub(super) fn number(value: f64, decimals: usize) -> String {
     let text = format!("{value:.decimals$}");
     let zero = text.trim_start_matches('-').chars().all(|c| c == '0' || c == '.');
     if zero { text.trim_start_matches('-').to_owned() } else { text.replace('-', "−") }
+}
+
+/// A power of ten for a tick.
+pub(super) fn power(exponent: f64) -> String {
+    let value = 10.0_f64.powf(exponent);
+    number(value, (1.0 - exponent.floor()).clamp(0.0, 6.0) as usize)
 }
 
 /// Decimals that tell the ticks of an axis of this length apart.
@@ -214,6 +220,29 @@ pub(super) fn mesh_with<DB: DrawingBackend>(
         .y_desc(label(y_name, 60))
         .y_label_formatter(&y_label)
         .draw()
+}
+
+/// A curve: a line, thin where its points have no band; with `marks`, points with whiskers instead of a band.
+pub(super) fn draw_curve<DB: DrawingBackend>(
+    chart: &mut Chart<'_, DB>,
+    curve: &Curve,
+    color: RGBColor,
+    marks: bool,
+) -> Drawn<DB> {
+    let band: Vec<_> = curve.points.iter().filter_map(|p| p.band.map(|b| (p.step, b))).collect();
+    if marks {
+        let whisker =
+            |&(x, (low, high)): &(f64, (f64, f64))| PathElement::new(vec![(x, low), (x, high)], color.stroke_width(4));
+        chart.draw_series(band.iter().map(whisker))?;
+        chart.draw_series(curve.points.iter().map(|p| Circle::new((p.step, p.value), 8, color.filled())))?;
+    } else if !band.is_empty() {
+        let edge = band.iter().map(|&(x, (low, _))| (x, low));
+        let outline: Vec<_> = edge.chain(band.iter().rev().map(|&(x, (_, high))| (x, high))).collect();
+        chart.draw_series(std::iter::once(Polygon::new(outline, color.mix(0.18))))?;
+    }
+    let line = curve.points.iter().map(|p| (p.step, p.value));
+    chart.draw_series(LineSeries::new(line, color.stroke_width(if band.is_empty() { 4 } else { 6 })))?;
+    Ok(())
 }
 
 /// Horizontal dashed lines over the whole width of a chart.

@@ -15,7 +15,7 @@
 //! The file is missing, over 16 MiB, not such a document, or its link does not fit the scenario.
 //!
 //! # Reference
-//! The prior f_θ of arXiv 2512.03528, Eq. 1, in a form that can be handed on.
+//! The prior `f_θ` of arXiv 2512.03528, Eq. 1, in a form that can be handed on.
 //!
 //! # Differences from the reference implementation
 //! None known.

@@ -21,7 +21,7 @@
 //! Losses in bursts are not in it: see `markov`.
 //!
 //! # Reference
-//! The learned binary classifier f_θ(s^{ij}) of arXiv 2512.03528, Eq. 1; temperature: Guo et al. 2017.
+//! The learned binary classifier `f_θ(s^{ij})` of arXiv 2512.03528, Eq. 1; temperature: Guo et al. 2017.
 //!
 //! # Differences from the reference implementation
 //! The paper names such a prior and gives no network.
@@ -158,7 +158,7 @@ impl Classifier {
         }
         let numbers = self.mean.iter().chain(&self.scale);
         let weights = self.layers.iter().flat_map(|dense| dense.weight.iter().flatten().chain(&dense.bias));
-        if let Some(bad) = numbers.chain(weights).find(|v| !(v.abs() <= 1e9)) {
+        if let Some(bad) = numbers.chain(weights).find(|v| v.is_nan() || v.abs() > 1e9) {
             return Err(spec.invalid(format!("expected numbers within ±1e9, found {bad}")));
         }
         spec.in_range("temperature", self.temperature, 1e-3, 1e3)

@@ -15,7 +15,7 @@
 //! A link in it fails; all weights are 0. It cannot change within an episode: a `markov` matrix can.
 //!
 //! # Reference
-//! Domain randomisation (Tobin et al. 2017) over the paper's f_θ.
+//! Domain randomisation (Tobin et al. 2017) over the paper's `f_θ`.
 //!
 //! # Differences from the reference implementation
 //! None known.
@@ -120,15 +120,17 @@ mod tests {
     use super::*;
     use crate::link::{emit_rows, test_setting};
 
-    fn link(json: &str) -> Result<Box<dyn Link>, RegistryError> {
-        build(&serde_json::from_str(json).unwrap(), &test_setting(0.25))
+    fn spec(json: &str) -> Spec {
+        serde_json::from_str(json).unwrap()
     }
 
     #[test]
     fn links_are_drawn_per_episode_by_weight_and_each_is_as_if_alone() {
-        let mixture =
-            link(r#"{"name":"mixture","links":["none",{"name":"dropout","p":0.5},"perfect"],"weights":[1,3,0]}"#)
-                .unwrap();
+        let mixture = build(
+            &spec(r#"{"name":"mixture","links":["none",{"name":"dropout","p":0.5},"perfect"],"weights":[1,3,0]}"#),
+            &test_setting(0.25),
+        )
+        .unwrap();
         let alone = super::super::build(&Spec::new("dropout").with("p", 0.5), &test_setting(0.25)).unwrap();
         let mut silent = 0;
         for episode in 0..2000 {
@@ -144,8 +146,8 @@ mod tests {
 
     #[test]
     fn text_names_links_too_and_is_resolved() {
-        let spec = Spec::parse("link", LINKS, "mixture:perfect, dropout:0.5").unwrap();
-        let mixture = build(&spec, &test_setting(0.25)).unwrap();
+        let named = Spec::parse("link", LINKS, "mixture:perfect, dropout:0.5").unwrap();
+        let mixture = build(&named, &test_setting(0.25)).unwrap();
         let json = Value::Object(mixture.parameters()).to_string();
         let expected =
             r#"{"name":"mixture","links":[{"name":"perfect"},{"name":"dropout","p":0.5}],"weights":[1.0,1.0]}"#;
@@ -154,7 +156,7 @@ mod tests {
 
     #[test]
     fn malformed_mixtures_are_refused() {
-        let error = |json: &str| link(json).err().unwrap().to_string();
+        let error = |json: &str| build(&spec(json), &test_setting(0.25)).err().unwrap().to_string();
         assert_eq!(error(r#"{"name":"mixture","links":[]}"#), "mixture: expected 1 to 64 links, found 0");
         assert_eq!(
             error(r#"{"name":"mixture","links":["none"],"weights":[1,2]}"#),

@@ -1,7 +1,7 @@
 //! Recorded link bits for the `trace` link: from a store, or from a table of (episode, step, sender, receiver,
 //! delivered).
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::Path;
 
@@ -16,7 +16,7 @@ use crate::storage::{self, EpisodeSource};
 const COLUMNS: [&str; 5] = ["episode", "step", "sender", "receiver", "delivered"];
 
 /// Most agents in a table: there are as many links as their square.
-const MAX_AGENTS: usize = 4096;
+const MAX_AGENTS: u32 = 4096;
 
 /// Reads the link bits of a rollout store, or of a CSV or Parquet table with the columns `episode`, `step`, `sender`,
 /// `receiver` and `delivered` (true, false, 1 or 0). Episodes and steps count from 0 without gaps; every ordered pair of
@@ -107,9 +107,11 @@ fn names(path: &Path, parquet: bool) -> Result<Vec<String>, RegistryError> {
 struct Table {
     episodes: Vec<u64>,
     steps: Vec<u64>,
-    senders: Vec<String>,
-    receivers: Vec<String>,
+    /// Numbers of agents in `names`.
+    senders: Vec<u32>,
+    receivers: Vec<u32>,
     delivered: Vec<bool>,
+    names: BTreeMap<String, u32>,
 }
 
 impl Table {
@@ -133,25 +135,24 @@ impl Table {
         let column =
             |name: &'static str| -> Result<&Column, RegistryError> { caught(path, parquet, || frame.column(name)) };
         let whole = |name: &'static str| -> Result<Vec<u64>, RegistryError> {
-            let texts = texts(column(name)?, path)?;
-            let parse = |(row, text): (usize, &String)| {
-                text.trim().parse::<u64>().map_err(|_e| expected(name, row, "a whole number from 0", text, path))
-            };
-            texts.iter().enumerate().map(parse).collect()
+            each(column(name)?, path, |text| text.parse().map_err(|_e| "a whole number from 0"))
         };
-        let delivered = texts(column("delivered")?, path)?;
-        let bit = |(row, text): (usize, &String)| match text.trim().to_ascii_lowercase().as_str() {
+        let mut names = BTreeMap::new();
+        let mut agents = |name: &'static str| -> Result<Vec<u32>, RegistryError> {
+            each(column(name)?, path, |text| {
+                let next = names.len() as u32;
+                let known = names.get(text).copied();
+                let number = known.unwrap_or_else(|| *names.entry(text.to_owned()).or_insert(next));
+                if number < MAX_AGENTS { Ok(number) } else { Err("one of 4096 agents or fewer") }
+            })
+        };
+        let (senders, receivers) = (agents("sender")?, agents("receiver")?);
+        let delivered = each(column("delivered")?, path, |text| match text.to_ascii_lowercase().as_str() {
             "1" | "true" => Ok(true),
             "0" | "false" => Ok(false),
-            _ => Err(expected("delivered", row, "true, false, 1 or 0", text, path)),
-        };
-        Ok(Self {
-            episodes: whole("episode")?,
-            steps: whole("step")?,
-            senders: texts(column("sender")?, path)?,
-            receivers: texts(column("receiver")?, path)?,
-            delivered: delivered.iter().enumerate().map(bit).collect::<Result<_, _>>()?,
-        })
+            _ => Err("true, false, 1 or 0"),
+        })?;
+        Ok(Self { episodes: whole("episode")?, steps: whole("step")?, senders, receivers, delivered, names })
     }
 
     /// Puts the rows in order and checks that none is missing or there twice.
@@ -160,23 +161,22 @@ impl Table {
         if rows == 0 {
             return Err("it has no rows".to_owned());
         }
-        let labels: BTreeSet<&str> = self.senders.iter().chain(&self.receivers).map(String::as_str).collect();
-        let n = labels.len();
-        if !(2..=MAX_AGENTS).contains(&n) {
+        let n = self.names.len();
+        if n < 2 {
             return Err(format!("expected 2 to {MAX_AGENTS} agents among senders and receivers, found {n}"));
         }
-        let mut agents: Vec<&str> = labels.into_iter().collect();
-        let numbers: Option<Vec<usize>> = agents.iter().map(|a| a.parse().ok()).collect();
-        if numbers.is_some() {
-            agents.sort_by_key(|a| a.parse::<usize>().unwrap_or(usize::MAX));
+        let mut agents: Vec<(&str, u32)> = self.names.iter().map(|(name, &number)| (name.as_str(), number)).collect();
+        if agents.iter().all(|(name, _)| name.parse::<u64>().is_ok()) {
+            agents.sort_by_key(|(name, _)| name.parse::<u64>().unwrap_or(u64::MAX));
         }
-        let place: std::collections::BTreeMap<&str, usize> = agents.iter().enumerate().map(|(i, &a)| (a, i)).collect();
+        let mut place = vec![0; n];
+        agents.iter().enumerate().for_each(|(i, &(_, number))| place[number as usize] = i);
         let links = n * (n - 1);
         let mut keys = Vec::with_capacity(rows);
         for row in 0..rows {
-            let (s, r) = (place[self.senders[row].as_str()], place[self.receivers[row].as_str()]);
+            let (s, r) = (place[self.senders[row] as usize], place[self.receivers[row] as usize]);
             if s == r {
-                return Err(format!("row {}: {:?} sends to itself: leave such rows out", row + 1, self.senders[row]));
+                return Err(format!("row {}: {:?} sends to itself: leave such rows out", row + 1, agents[s].0));
             }
             keys.push((self.episodes[row], self.steps[row], s * (n - 1) + r - usize::from(r > s), row));
         }
@@ -191,7 +191,7 @@ impl Table {
             if (episode, step, link) != want {
                 let name = |link: usize| {
                     let (s, r) = (link / (n - 1), link % (n - 1));
-                    format!("{} to {}", agents[s], agents[r + usize::from(r >= s)])
+                    format!("{} to {}", agents[s].0, agents[r + usize::from(r >= s)].0)
                 };
                 let (found, wanted) = (name(link), name(want.2));
                 return Err(format!(
@@ -209,17 +209,24 @@ impl Table {
         }
         starts.push(starts[starts.len() - 1] + want.1 as usize);
         let bits = keys.iter().map(|&(.., row)| self.delivered[row]).collect();
-        Ok(Trace { agents: agents.into_iter().map(ToOwned::to_owned).collect(), starts, bits, sha256 })
+        Ok(Trace { agents: agents.into_iter().map(|(name, _)| name.to_owned()).collect(), starts, bits, sha256 })
     }
 }
 
-/// A column as text; an empty cell is an error.
-fn texts(column: &Column, path: &Path) -> Result<Vec<String>, RegistryError> {
+/// Reads a column cell by cell, as text without the blanks around it; an empty cell is an error, and so is one that
+/// `read` refuses, with what it expected.
+fn each<T>(
+    column: &Column,
+    path: &Path,
+    mut read: impl FnMut(&str) -> Result<T, &'static str>,
+) -> Result<Vec<T>, RegistryError> {
     let unfit = || refused(&format!("column {:?} holds {}", column.name(), column.dtype()), path);
     let cast = column.cast(&DataType::String).ok().ok_or_else(unfit)?;
     let values = cast.str().ok().ok_or_else(unfit)?;
     let cell = |(row, value): (usize, Option<&str>)| {
-        value.map(ToOwned::to_owned).ok_or_else(|| expected(column.name(), row, "a value", "", path))
+        let text = value.map(str::trim).ok_or("a value");
+        let read = text.and_then(&mut read);
+        read.map_err(|wanted| expected(column.name(), row, wanted, value.unwrap_or_default(), path))
     };
     values.iter().enumerate().map(cell).collect()
 }
@@ -232,11 +239,15 @@ fn expected(column: &str, row: usize, wanted: &str, found: &str, path: &Path) ->
 mod tests {
     use super::*;
 
+    /// Reads the text as a file `t.csv`.
     fn read(text: &str) -> Result<Trace, String> {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("t.csv");
-        crate::io::write_atomic(&path, text.as_bytes()).unwrap();
-        read_trace(&path).map_err(|e| e.to_string().replace(path.to_str().unwrap(), "t.csv"))
+        let read = || -> std::io::Result<_> {
+            let dir = tempfile::tempdir()?;
+            let path = dir.path().join("t.csv");
+            std::fs::File::create(&path).and_then(|mut file| std::io::Write::write_all(&mut file, text.as_bytes()))?;
+            Ok(read_trace(&path).map_err(|e| e.to_string().replace(path.to_string_lossy().as_ref(), "t.csv")))
+        };
+        read().map_err(|e| e.to_string())?
     }
 
     const HEAD: &str = "episode,step,sender,receiver,delivered\n";
