@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use sha2::{Digest as _, Sha256};
 
-use crate::nn::{Activation, Mlp, NnError, Rows, Tape, from_tensors, to_tensors};
+use crate::nn::{Activation, FewRows, Mlp, NnError, Tape, from_tensors, to_tensors};
 use crate::rng::Stream;
 use crate::schema::{AgentSpec, hex};
 
@@ -202,12 +202,12 @@ impl Actors {
     }
 
     /// The networks with these parameters, laid out for acting on few rows.
-    pub fn rows(&self, params: &[f32]) -> Vec<Rows> {
-        self.networks.iter().enumerate().map(|(i, network)| Rows::new(network, self.slice(params, i))).collect()
+    pub fn rows(&self, params: &[f32]) -> Vec<FewRows> {
+        self.networks.iter().enumerate().map(|(i, network)| FewRows::new(network, self.slice(params, i))).collect()
     }
 
     /// Takes over changed parameters in networks of [`Actors::rows`].
-    pub fn set_rows(&self, params: &[f32], rows: &mut [Rows]) {
+    pub fn set_rows(&self, params: &[f32], rows: &mut [FewRows]) {
         rows.iter_mut().enumerate().for_each(|(i, network)| network.set(self.slice(params, i)));
     }
 

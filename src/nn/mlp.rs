@@ -30,7 +30,7 @@ pub enum Activation {
 }
 
 impl Activation {
-    pub(super) fn apply(self, z: f32) -> f32 {
+    fn apply(self, z: f32) -> f32 {
         match self {
             Self::Identity => z,
             Self::Relu => z.max(0.0),

@@ -4,15 +4,15 @@
 //! times the fused passes. All arithmetic runs on the calling thread in a fixed order: the same bytes every time.
 
 mod adam;
+mod few;
 mod mlp;
 mod params;
 mod product;
-mod rows;
 
 pub use adam::{Adam, AdamConfig, clip_norm, soft_update};
+pub use few::{FewRows, FewScratch};
 pub use mlp::{Activation, Mlp, Tape};
 pub use params::{Params, ParamsRef, from_tensors, to_tensors};
-pub use rows::{Rows, RowsScratch};
 
 /// What can go wrong with networks and their files.
 #[derive(Debug, thiserror::Error)]

@@ -28,7 +28,7 @@ use serde_json::{Map, Value};
 
 use super::{Build, Policy, PolicyEpisode, View, Widths, part, part_mut};
 use crate::algo::{Actors, RunPolicyError};
-use crate::nn::{Rows, RowsScratch};
+use crate::nn::{FewRows, FewScratch};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::{self, Seeds, Stream};
 use crate::scenario::{self, Scenario, offsets};
@@ -112,7 +112,7 @@ pub struct Trained {
     pub actors: Actors,
     /// Exploration.
     pub noise: ActionNoise,
-    networks: Vec<Rows>,
+    networks: Vec<FewRows>,
     parameters: Map<String, Value>,
 }
 
@@ -192,7 +192,7 @@ impl Policy for Trained {
             scenario,
             row: Vec::new(),
             inputs: vec![Vec::new(); self.networks.len()],
-            scratch: RowsScratch::default(),
+            scratch: FewScratch::default(),
         })
     }
 }
@@ -214,7 +214,7 @@ struct Acting<'a> {
     row: Vec<f32>,
     /// Per learner `[worlds, input]`.
     inputs: Vec<Vec<f32>>,
-    scratch: RowsScratch,
+    scratch: FewScratch,
 }
 
 impl PolicyEpisode for Acting<'_> {

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use assert_cmd::Command;
 use ccmarl::algo::Actors;
 use ccmarl::link::{self, LINKS, Link, Setting};
-use ccmarl::nn::{Activation, Tape};
+use ccmarl::nn::{Activation, FewScratch, Tape};
 use ccmarl::record::{ActionNoise, Options, POLICIES, Policy, RecordError, Recording, Trained, build_policy};
 use ccmarl::registry::Spec;
 use ccmarl::rng::Seeds;
@@ -153,6 +153,17 @@ fn a_team_acts_on_its_observation_and_the_messages_that_arrived_and_its_noise_fa
     let noisy = parts.recording(1, 0).together(&layout, 3, 2);
     assert_ne!(noisy[0].actions, parts.recording(1, 0).episode(4).actions);
     assert_eq!(noisy[1].actions, calm.actions, "no noise is left in episode 4");
+}
+
+#[test]
+fn acting_allocates_nothing_once_it_is_warm() {
+    let parts = Parts::new("simple_spread", 3, "dropout:0.5", "random");
+    let (trained, params) = team(&*parts.0, ActionNoise::None);
+    let networks = trained.actors.rows(&params);
+    let (input, mut scratch) = (vec![0.5; 5 * 54], FewScratch::default());
+    networks[0].forward(&input, 5, &mut scratch);
+    let counted = crate::allocations::allocations(|| _ = networks[1].forward(&input, 5, &mut scratch));
+    assert_eq!(counted, 0);
 }
 
 #[test]

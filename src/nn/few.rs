@@ -2,8 +2,8 @@
 //! beside it, so that worlds stepped together and one by one act alike, to the bit.
 //!
 //! Every sum runs over the inputs in order, starting from the bias, fused where the processor can. [`Mlp::forward`] is
-//! the pass for minibatches, over the parameters as they lie; the two agree to rounding. Here the weights are laid out
-//! anew after each change, inputs by outputs: measured at 4 rows of 54-64-64-2, a seventh of the time of the products.
+//! the pass for minibatches; the two agree to rounding. Here the weights are laid out anew after each change, inputs by
+//! outputs. `reports/rollout` has what acting costs.
 #![cfg_attr(
     target_arch = "x86_64",
     expect(unsafe_code, reason = "calls of functions compiled for instructions that were found at run time")
@@ -16,7 +16,7 @@ const LANES: usize = 16;
 
 /// A perceptron laid out for acting.
 #[derive(Clone, Debug)]
-pub struct Rows {
+pub struct FewRows {
     layers: Vec<Layer>,
     instructions: Instructions,
 }
@@ -36,7 +36,7 @@ struct Layer {
 
 /// What a pass computes in; reused, so that passes allocate nothing once it is warm.
 #[derive(Clone, Debug, Default)]
-pub struct RowsScratch {
+pub struct FewScratch {
     sums: Vec<f32>,
     values: [Vec<f32>; 2],
 }
@@ -66,7 +66,7 @@ impl Instructions {
     }
 }
 
-impl Rows {
+impl FewRows {
     /// `mlp` with these parameters.
     ///
     /// # Panics
@@ -96,8 +96,8 @@ impl Rows {
     ///
     /// # Panics
     /// When the input is shorter than its shape.
-    pub fn forward<'s>(&self, input: &[f32], rows: usize, scratch: &'s mut RowsScratch) -> &'s [f32] {
-        let RowsScratch { sums, values: [from, to] } = scratch;
+    pub fn forward<'s>(&self, input: &[f32], rows: usize, scratch: &'s mut FewScratch) -> &'s [f32] {
+        let FewScratch { sums, values: [from, to] } = scratch;
         let mut width = self.layers[0].inputs;
         from.clear();
         from.extend_from_slice(&input[..rows * width]);
@@ -109,8 +109,11 @@ impl Rows {
                 to.extend_from_slice(&row[..layer.outputs]);
             }
             match layer.activation {
+                Activation::Identity => {}
                 Activation::Relu => to.iter_mut().for_each(|z| *z = z.max(0.0)),
-                other => to.iter_mut().for_each(|z| *z = other.apply(*z)),
+                Activation::LeakyRelu => to.iter_mut().for_each(|z| *z = z.max(0.01 * *z)),
+                Activation::Tanh => to.iter_mut().for_each(|z| *z = z.tanh()),
+                Activation::Sigmoid => to.iter_mut().for_each(|z| *z = 1.0 / (1.0 + (-*z).exp())),
             }
             std::mem::swap(from, to);
             width = layer.outputs;
@@ -255,8 +258,8 @@ mod tests {
     fn a_pass_equals_the_minibatch_pass_to_rounding_and_a_row_is_the_same_alone_and_among_others() {
         for widths in [&[54, 64, 64, 2][..], &[7, 20, 5], &[1, 1], &[3, 130, 17]] {
             let (mlp, params, input) = case(widths, 11);
-            let rows = Rows::new(&mlp, &params);
-            let (mut scratch, mut alone, mut tape) = (RowsScratch::default(), RowsScratch::default(), Tape::default());
+            let rows = FewRows::new(&mlp, &params);
+            let (mut scratch, mut alone, mut tape) = (FewScratch::default(), FewScratch::default(), Tape::default());
             let together = rows.forward(&input, 11, &mut scratch).to_vec();
             let reference = mlp.forward(&params, &input, 11, &mut tape);
             let error = together.iter().zip(reference).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
@@ -270,15 +273,15 @@ mod tests {
     #[test]
     fn every_set_of_instructions_that_fuses_gives_the_same_bits_and_the_plain_one_agrees_to_rounding() {
         let (mlp, params, input) = case(&[54, 64, 64, 2], 7);
-        let best = Rows::new(&mlp, &params);
-        let mut scratch = RowsScratch::default();
+        let best = FewRows::new(&mlp, &params);
+        let mut scratch = FewScratch::default();
         let expected = best.forward(&input, 7, &mut scratch).to_vec();
-        let plain = Rows { instructions: Instructions::Any, ..best.clone() };
+        let plain = FewRows { instructions: Instructions::Any, ..best.clone() };
         let error = plain.forward(&input, 7, &mut scratch).iter().zip(&expected).map(|(a, b)| (a - b).abs());
         assert!(error.fold(0.0, f32::max) < 2e-6);
         #[cfg(target_arch = "x86_64")]
         if best.instructions != Instructions::Any {
-            let fma = Rows { instructions: Instructions::Fma, ..best };
+            let fma = FewRows { instructions: Instructions::Fma, ..best };
             assert_eq!(fma.forward(&input, 7, &mut scratch), expected);
         }
     }
@@ -286,11 +289,11 @@ mod tests {
     #[test]
     fn changed_parameters_are_taken_over() {
         let (mlp, params, input) = case(&[5, 20, 3], 2);
-        let mut rows = Rows::new(&mlp, &vec![0.0; params.len()]);
-        let mut scratch = RowsScratch::default();
+        let mut rows = FewRows::new(&mlp, &vec![0.0; params.len()]);
+        let mut scratch = FewScratch::default();
         assert_eq!(rows.forward(&input, 2, &mut scratch), [0.0; 6]);
         rows.set(&params);
-        let fresh = Rows::new(&mlp, &params).forward(&input, 2, &mut RowsScratch::default()).to_vec();
+        let fresh = FewRows::new(&mlp, &params).forward(&input, 2, &mut FewScratch::default()).to_vec();
         assert_eq!(rows.forward(&input, 2, &mut scratch), fresh);
     }
 }
