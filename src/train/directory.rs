@@ -1,5 +1,6 @@
 //! A run directory: what may lie in it, how it appears, and what a kill leaves in it.
 
+use std::fs::{File, TryLockError};
 use std::path::Path;
 
 use super::protocol::STANDARD_FILE;
@@ -34,17 +35,31 @@ pub(super) fn refuse_foreign(dir: &Path, force: bool) -> Result<(), TrainError> 
     if known && run { Ok(()) } else { Err(IoError::Foreign(dir.to_owned()).into()) }
 }
 
+/// Holds a directory for this process, if it is there: two that train into one would undo each other's work. The
+/// operating system lets go when the process ends, so no lock is ever stale; where it has no locks there is only the name.
+pub(super) fn hold(dir: &Path) -> Result<Option<File>, TrainError> {
+    let Ok(file) = File::open(dir) else { return Ok(None) };
+    match file.try_lock() {
+        Err(TryLockError::WouldBlock) => Err(TrainError::Busy(dir.to_owned())),
+        Ok(()) | Err(TryLockError::Error(_)) => Ok(Some(file)),
+    }
+}
+
 /// Makes the directory of a run that has not taken a step: with its configuration and first checkpoint it appears under
-/// its name, and only then is what was there gone.
-pub(super) fn create(trainer: &mut Trainer, force: bool) -> Result<(), TrainError> {
+/// its name, and only then is what was there gone. It is held from its first file on; the lock goes with the rename.
+pub(super) fn create(trainer: &mut Trainer, force: bool) -> Result<Option<File>, TrainError> {
     let dir = trainer.dir.clone();
     let partial = io::partial_path(&dir);
+    drop(hold(&partial)?); // a living writer's partial is not removed
     io::remove(&partial)?;
+    io::create_parent(&partial.join(CONFIG))?;
+    let held = hold(&partial)?;
     trainer.dir.clone_from(&partial);
     let saved = write_config(trainer).and_then(|()| trainer.save());
     trainer.dir.clone_from(&dir);
     saved?;
-    Ok(io::publish(&partial, &dir, force, CONFIG)?)
+    io::publish(&partial, &dir, force, CONFIG)?;
+    Ok(held)
 }
 
 /// Writes `config.toml`.

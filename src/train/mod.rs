@@ -81,6 +81,9 @@ pub enum TrainError {
         /// Run directory.
         path: PathBuf,
     },
+    /// Somebody else writes there.
+    #[error("another process is training into this directory: wait for its end, or give another --out: {}", .0.display())]
+    Busy(PathBuf),
     /// A checkpoint that does not belong to this run.
     #[error("cannot resume: {message}: {}", path.display())]
     Resume {

@@ -63,6 +63,7 @@ pub fn train(
     if !options.resume {
         directory::refuse_foreign(dir, options.force)?;
     }
+    let _old = directory::hold(dir)?;
     let mut trainer = Trainer::new(config, dir)?;
     if options.resume {
         trainer.resume()?;
@@ -75,12 +76,13 @@ pub fn train(
         None => None,
     };
     // nothing that was there is touched before everything that can be refused has been
-    if options.resume {
+    let _new = if options.resume {
         directory::remove_leftovers(dir)?;
         directory::write_config(&trainer)?;
+        None
     } else {
-        directory::create(&mut trainer, options.force)?;
-    }
+        directory::create(&mut trainer, options.force)?
+    };
     let mut saved = trainer.update;
     while trainer.step < trainer.config.steps && !stop.load(Ordering::Relaxed) {
         trainer.advance(sink.as_deref_mut())?;

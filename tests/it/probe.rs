@@ -10,7 +10,7 @@ use ccmarl::record::{ActionNoise, Trained};
 use ccmarl::registry::Spec;
 use ccmarl::rng::{Stream, bernoulli};
 use ccmarl::scenario::{ActionSpace, Base, Body, Decoder, Integration, Laws, Physics, Scenario, Scratch, Team};
-use ccmarl::schema::{AgentSpec, Controller};
+use ccmarl::schema::{AgentSpec, Controller, Episode};
 use ccmarl::train::{TrainConfig, Trainer, evaluate};
 use serde_json::{Map, Value};
 
@@ -119,7 +119,7 @@ fn share() -> f64 {
     let policy = build_policy(&Spec::new("scripted"), &probe).unwrap();
     let recording = Recording { scenario: &probe, link: &*link, policy: &*policy, seed: 1, episodes: 400 };
     let episodes = recording.together(&recording.layout(), 0, 400);
-    let mean = episodes.iter().map(|e| e.episode_return()).sum::<f64>() / 400.0;
+    let mean = episodes.iter().map(Episode::episode_return).sum::<f64>() / 400.0;
     assert!((mean - OPTIMUM).abs() < 1e-6, "the oracle earns the optimum, found {mean}");
     episodes.iter().filter(|e| e.observations[SENDER].data[0] > 0.0).count() as f64 / 400.0
 }

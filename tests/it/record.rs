@@ -4,7 +4,7 @@ use std::io::{BufRead as _, BufReader};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use assert_cmd::Command;
-use ccmarl::algo::Actors;
+use ccmarl::algo::{Actors, Team, TeamScratch};
 use ccmarl::link::{LINKS, Link};
 use ccmarl::nn::{Activation, Tape};
 use ccmarl::record::{
@@ -154,6 +154,18 @@ fn a_team_acts_on_its_observation_and_the_messages_that_arrived_and_its_noise_fa
     let noisy = parts.recording(1, 0).together(&layout, 3, 2);
     assert_ne!(noisy[0].actions, parts.recording(1, 0).episode(4).actions);
     assert_eq!(noisy[1].actions, calm.actions, "no noise is left in episode 4");
+}
+
+#[test]
+fn acting_allocates_nothing_once_it_is_warm() {
+    let parts = Parts::new("simple_spread", 3, "dropout:0.5", "random");
+    let (trained, params) = team(&*parts.0, ActionNoise::None);
+    let (mut acting, mut scratch) = (Team::default(), TeamScratch::default());
+    acting.load_forward(&trained.actors, &params);
+    let (observations, link) = (vec![0.5; 5 * 54], [false; 45]);
+    acting.act(&trained.actors, &observations, &link, 5, &mut scratch);
+    let counted = crate::allocations::allocations(|| acting.act(&trained.actors, &observations, &link, 5, &mut scratch));
+    assert_eq!(counted, 0);
 }
 
 #[test]

@@ -285,6 +285,21 @@ fn a_kill_before_the_first_checkpoint_leaves_no_run_and_one_amid_a_write_leaves_
 }
 
 #[test]
+fn a_run_that_somebody_is_training_is_left_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("run");
+    run(config("maddpg", 500), &path, &Options::default());
+    let other = std::fs::File::open(&path).unwrap();
+    other.lock().unwrap();
+    for options in [Options { resume: true, ..Options::default() }, Options { force: true, ..Options::default() }] {
+        let error = train(config("maddpg", 900), &path, &options, &mut |_| {}, &AtomicBool::new(false)).unwrap_err();
+        assert!(error.to_string().starts_with("another process is training into this directory: wait"), "{error}");
+    }
+    drop(other);
+    run(config("maddpg", 900), &path, &Options { resume: true, ..Options::default() });
+}
+
+#[test]
 fn a_damaged_checkpoint_is_refused() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("run");
