@@ -323,9 +323,8 @@ impl Maddpg {
     fn actor_pass(&mut self, batch: &Batch) -> (f64, f32) {
         let widths = Widths::of(&self.actors);
         let (actors, critic) = (&self.actors, &self.critic);
-        let Scratch {
-            joint, team, passes, grad_q, grad_joint, grad_action, actor_grads, critic: packed, ..
-        } = &mut self.scratch;
+        let Scratch { joint, team, passes, grad_q, grad_joint, grad_action, actor_grads, critic: packed, .. } =
+            &mut self.scratch;
         team.load(actors, &self.params.actors.read());
         team.clear_grads(actors);
         critic.pack(&self.params.critic.read(), packed);
@@ -401,7 +400,8 @@ struct Tile<'a> {
 
 impl<'a> Tile<'a> {
     fn of(batch: &'a Batch, start: usize, rows: usize, widths: Widths, learners: usize) -> Self {
-        let [o, a, l] = [widths.observations, widths.actions, learners * learners].map(|w| start * w..(start + rows) * w);
+        let [o, a, l] =
+            [widths.observations, widths.actions, learners * learners].map(|w| start * w..(start + rows) * w);
         Self {
             observations: &batch.observations[o.clone()],
             next_observations: &batch.next_observations[o],
@@ -551,8 +551,7 @@ mod tests {
             let mut learner = Maddpg::new(&agents, Activation::Sigmoid, config, &Seeds::new(4)).unwrap();
             learner.td_pass(&batch, &[], false);
             let (found, _) = learner.actor_pass(&batch);
-            let groups: &[&[usize]] =
-                if actor_step == ActorStep::Joint { &[&[0, 1], &[0, 1]] } else { &[&[0], &[1]] };
+            let groups: &[&[usize]] = if actor_step == ActorStep::Joint { &[&[0, 1], &[0, 1]] } else { &[&[0], &[1]] };
             let mean = groups.iter().map(|fresh| objective(&learner, &batch, fresh)).sum::<f64>() / 2.0;
             assert!((found - mean).abs() < 1e-6, "{found} and {mean}");
             let start = learner.params.actors.read().to_vec();

@@ -10,9 +10,7 @@ use std::f64::consts::LN_2;
 use rand::Rng;
 
 use super::critic::Separable;
-use crate::nn::{
-    Finish, LANES, Left, Level, Lines, Mlp, Operation, Product, Simd, SlidingDots, SlidingSums, exp, ln,
-};
+use crate::nn::{Finish, LANES, Left, Level, Lines, Mlp, Operation, Product, Simd, SlidingDots, SlidingSums, exp, ln};
 use crate::rng;
 
 /// Shifts are drawn from so many neighbours: what they reach stays in the first-level cache.
@@ -148,9 +146,7 @@ impl Side {
         }
         .compute();
         let (weight, bias) = grads.split_at_mut(outputs * inputs);
-        for ((to, bias), from) in
-            weight.chunks_exact_mut(inputs).zip(bias).zip(self.grad_weight.chunks_exact(width))
-        {
+        for ((to, bias), from) in weight.chunks_exact_mut(inputs).zip(bias).zip(self.grad_weight.chunks_exact(width)) {
             to.iter_mut().zip(from).for_each(|(to, from)| *to += from);
             *bias += from[inputs];
         }

@@ -116,8 +116,7 @@ impl Operation for Step<'_> {
         let n = self.params.len();
         assert!([self.grads.len(), self.m.len(), self.v.len()] == [n; 3]);
         assert!(self.target.is_empty() || self.target.len() == n);
-        let [params, m, v, target] =
-            [&mut self.params, &mut self.m, &mut self.v, &mut self.target].map(|slice| std::mem::take(slice));
+        let [params, m, v, target] = [&mut self.params, &mut self.m, &mut self.v, &mut self.target].map(std::mem::take);
         let follows = !target.is_empty();
         let whole = n - n % S::WIDTH;
         for at in (0..whole).step_by(S::WIDTH) {
@@ -193,7 +192,17 @@ mod tests {
             let before = (adam.clone(), params.clone(), target.clone());
             let Adam { config, m, v, .. } = &mut adam;
             let (params_of, target_of) = (&mut params, &mut target);
-            level.run(Step { config: *config, step: 0.1, root2: 0.5, tau: 0.25, params: params_of, grads: &grads, m, v, target: target_of });
+            level.run(Step {
+                config: *config,
+                step: 0.1,
+                root2: 0.5,
+                tau: 0.25,
+                params: params_of,
+                grads: &grads,
+                m,
+                v,
+                target: target_of,
+            });
             for i in 0..n {
                 let g = f64::from(grads[i]);
                 let [b1, b2] = [0.9f32, 0.999].map(|b| [f64::from(b), f64::from(1.0 - b)]);

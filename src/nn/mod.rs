@@ -15,14 +15,14 @@ mod sliding;
 mod vector;
 
 pub use adam::{Adam, AdamConfig, clip_norm};
-pub use mlp::{Activation, Mlp, Tape};
 pub(crate) use kernel::{Finish, Left, Product};
+pub use mlp::{Activation, Mlp, Tape};
+pub use params::{Params, ParamsRef, from_tensors, to_tensors};
 pub(crate) use passes::{Input, Packed, Passes, TILE};
 pub use simd::Level;
 pub(crate) use simd::{LANES, Operation, Simd};
 pub(crate) use sliding::{Lines, SlidingDots, SlidingSums};
 pub(crate) use vector::{exp, exp_in_place, ln};
-pub use params::{Params, ParamsRef, from_tensors, to_tensors};
 
 /// What can go wrong with networks and their files.
 #[derive(Debug, thiserror::Error)]

@@ -160,7 +160,13 @@ impl Dumie {
     }
 
     /// One step of one estimator, when it has pairs enough.
-    fn learn(&mut self, class: Class, index: usize, replay: &Replay, rng: &mut Stream) -> Result<Option<f64>, TrainError> {
+    fn learn(
+        &mut self,
+        class: Class,
+        index: usize,
+        replay: &Replay,
+        rng: &mut Stream,
+    ) -> Result<Option<f64>, TrainError> {
         let estimators = if class == Class::Delivered { &mut self.jsd } else { &mut self.club };
         let estimator = &mut estimators[index];
         if estimator.ring.len() < self.config.start {
@@ -174,8 +180,7 @@ impl Dumie {
         let estimators = if class == Class::Delivered { &mut self.jsd } else { &mut self.club };
         let Estimator { params, adam, .. } = &mut estimators[index];
         let data = [&replay.observations[..], &replay.actions];
-        let value =
-            if found { Some(self.nets.step(class, params, adam, &pairs, data, rng)?) } else { None };
+        let value = if found { Some(self.nets.step(class, params, adam, &pairs, data, rng)?) } else { None };
         self.pairs[0][index] = pairs;
         Ok(value)
     }

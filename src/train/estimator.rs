@@ -79,7 +79,12 @@ pub struct Estimator {
 
 impl Estimator {
     /// A fresh one that keeps `ring` pairs of these widths.
-    pub(super) fn new(params: Vec<f32>, learning_rate: f32, ring: usize, widths: [usize; 2]) -> Result<Self, TrainError> {
+    pub(super) fn new(
+        params: Vec<f32>,
+        learning_rate: f32,
+        ring: usize,
+        widths: [usize; 2],
+    ) -> Result<Self, TrainError> {
         Ok(Self {
             adam: Adam::new(AdamConfig::new(learning_rate), params.len()),
             params: Params::new(params)?,
@@ -161,7 +166,13 @@ impl Nets {
     }
 
     /// One step on `n` pairs drawn from the estimator's ring; returns the minibatch's mean value before it.
-    pub(super) fn learn(&mut self, class: Class, of: &mut Estimator, n: usize, rng: &mut Stream) -> Result<f64, TrainError> {
+    pub(super) fn learn(
+        &mut self,
+        class: Class,
+        of: &mut Estimator,
+        n: usize,
+        rng: &mut Stream,
+    ) -> Result<f64, TrainError> {
         let mut pairs = std::mem::take(&mut self.pairs);
         pairs.clear();
         let [m, a] = of.ring.widths;
@@ -226,11 +237,26 @@ impl Nets {
     }
 
     /// Values of the pairs of a minibatch's transitions into `self.values`; returns the mean.
-    pub(super) fn evaluate(&mut self, class: Class, of: &Estimator, pairs: &Pairs, data: [&[f32]; 2], rng: &mut Stream) {
+    pub(super) fn evaluate(
+        &mut self,
+        class: Class,
+        of: &Estimator,
+        pairs: &Pairs,
+        data: [&[f32]; 2],
+        rng: &mut Stream,
+    ) {
         self.values_of(class, &of.params.read(), pairs, data, self.near, rng);
     }
 
-    fn values_of(&mut self, class: Class, params: &[f32], pairs: &Pairs, data: [&[f32]; 2], near: usize, rng: &mut Stream) -> f64 {
+    fn values_of(
+        &mut self,
+        class: Class,
+        params: &[f32],
+        pairs: &Pairs,
+        data: [&[f32]; 2],
+        near: usize,
+        rng: &mut Stream,
+    ) -> f64 {
         match class {
             Class::Delivered => self.jsd(params, pairs, data, near, false, rng),
             Class::Lost => self.club(params, pairs, data, near, rng),
@@ -238,7 +264,15 @@ impl Nets {
     }
 
     /// Shifted JSD values, and with `learn` the gradient of minus their mean.
-    fn jsd(&mut self, params: &[f32], pairs: &Pairs, data: [&[f32]; 2], near: usize, learn: bool, rng: &mut Stream) -> f64 {
+    fn jsd(
+        &mut self,
+        params: &[f32],
+        pairs: &Pairs,
+        data: [&[f32]; 2],
+        near: usize,
+        learn: bool,
+        rng: &mut Stream,
+    ) -> f64 {
         let (n, [messages, actions]) = (pairs.len(), pairs.of(data));
         self.values.resize(n, 0.0);
         let [_, _, grads] = &mut self.grads;

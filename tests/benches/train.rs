@@ -51,8 +51,7 @@ impl Bench {
         let scenario = ccmarl::scenario::build(&spec).unwrap();
         let link = link::build(&Spec::new("dropout").with("p", 0.2), &Setting { distance_unit: 1.0 }).unwrap();
         let policy = record::build_policy(&Spec::new("random"), &*scenario).unwrap();
-        let recording =
-            Recording { scenario: &*scenario, link: &*link, policy: &*policy, seed: 1, episodes: 400 };
+        let recording = Recording { scenario: &*scenario, link: &*link, policy: &*policy, seed: 1, episodes: 400 };
         let episodes: Vec<Episode> = (0..400).map(|index| recording.episode(index)).collect();
         let layout = scenario.layout();
         let learners: Vec<&AgentSpec> = layout.agents.iter().filter(|a| a.learner).collect();
@@ -151,11 +150,8 @@ fn main() {
         let ms = |seconds: f64| 1e3 * seconds;
         let parts = cost.parts.map(|part| format!("{:.3}", ms(part))).join(",");
         let rate = bench.flop() / cost.parts[3] * 1e-9;
-        let rates = if joint {
-            format!("{:.0},{rate:.0},{:.2}", bench.flop() * 1e-6, rate / kernel)
-        } else {
-            ",,".to_owned()
-        };
+        let rates =
+            if joint { format!("{:.0},{rate:.0},{:.2}", bench.flop() * 1e-6, rate / kernel) } else { ",,".to_owned() };
         line(format!("{name},{:.3},{parts},{rates}", ms(cost.all)));
     }
     if let Some(dir) = out {
