@@ -5,14 +5,16 @@
 //! of cost against number of agents.
 #![expect(clippy::unwrap_used, clippy::print_stdout, reason = "a benchmark prints, and panics where it cannot start")]
 
+mod cpu;
+
 use std::fmt::Write as _;
-use std::time::{Duration, Instant};
 
 use ccmarl::figure::{Curve, Data, FIGURES, Point, svg};
 use ccmarl::io::write_atomic;
 use ccmarl::registry::{Spec, find};
 use ccmarl::rng::{Seeds, Stream};
 use ccmarl::scenario::{Worlds, build};
+use cpu::cpu_seconds;
 
 /// Seconds of CPU time of one measurement, at least: a hundred times what Linux counts it in.
 const LONG: f64 = 0.4;
@@ -99,14 +101,4 @@ fn measure(spec: &Spec, count: usize) -> f64 {
     }
     assert!(observations.iter().chain(&rewards).all(|v| v.is_finite()));
     1.0 / best
-}
-
-/// Seconds of CPU time of this process's first thread where Linux tells it, else of the clock.
-fn cpu_seconds() -> f64 {
-    static START: std::sync::OnceLock<Instant> = std::sync::OnceLock::new();
-    let told = std::fs::read_to_string("/proc/self/schedstat").ok();
-    match told.and_then(|text| text.split(' ').next()?.parse().ok()) {
-        Some(nanoseconds) => Duration::from_nanos(nanoseconds).as_secs_f64(),
-        None => START.get_or_init(Instant::now).elapsed().as_secs_f64(),
-    }
 }
