@@ -15,96 +15,11 @@
 //! The batch goes through in tiles of 128 rows, each through every network before the next, so that activations stay
 //! in the second-level cache.
 
-use serde::{Deserialize, Serialize};
-
+use super::config::{ActorStep, MaddpgConfig, Messages};
 use super::{Actors, Team, TeamScratch};
 use crate::nn::{Activation, Adam, AdamConfig, Input, Mlp, NnError, Packed, Params, Passes, TILE, clip_norm};
 use crate::rng::Seeds;
 use crate::schema::AgentSpec;
-
-/// Every constant of the learner.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct MaddpgConfig {
-    /// Widths of the hidden layers of actors and critic.
-    pub hidden: Vec<usize>,
-    /// Adam's learning rate for all actors.
-    pub actor_learning_rate: f32,
-    /// Adam's learning rate for the critic.
-    pub critic_learning_rate: f32,
-    /// Discount per step.
-    pub gamma: f32,
-    /// Share of the online network that enters the target per update.
-    pub tau: f32,
-    /// Transitions per update, drawn with replacement; 1024, or 512 on `simple_tag` with six learners or more.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub batch: Option<usize>,
-    /// Largest L2 norm of the critic's gradient, and of each actor's.
-    pub grad_clip: f32,
-    /// Weight of mean a² in the actors' loss.
-    pub action_penalty: f32,
-    /// Whether messages enter the actors: "observation" (the sender's) or "off".
-    pub messages: Messages,
-    /// Whose actions are fresh in the actors' loss: "joint" or "per-agent".
-    pub actor_step: ActorStep,
-    /// Which link bits a minibatch sees: "kept" from the rollout, or "redrawn".
-    pub masks: Masks,
-}
-
-/// What a message is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Messages {
-    /// The sender's observation.
-    Observation,
-    /// Actors have no message inputs at all.
-    Off,
-}
-
-/// Whose actions are fresh in the actors' loss.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum ActorStep {
-    /// Everybody's: one pass through the critic (the paper's parent code).
-    Joint,
-    /// Only that of the actor at hand, the others' come from replay: one pass through the critic per actor (Lowe et
-    /// al. 2017).
-    PerAgent,
-}
-
-/// Which link bits a minibatch sees.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Masks {
-    /// Those drawn at rollout, `ι_t` for o and ι_{t+1} for o'.
-    Kept,
-    /// Those of another transition drawn from replay, the same for o and o' (as in Message-Dropout, for any prior):
-    /// the prior's law, but independent of where the agents are.
-    Redrawn,
-}
-
-impl MaddpgConfig {
-    /// The paper's batch, where nothing else is said.
-    pub const BATCH: usize = 1024;
-}
-
-impl Default for MaddpgConfig {
-    fn default() -> Self {
-        Self {
-            hidden: vec![64, 64],
-            actor_learning_rate: 1e-4,
-            critic_learning_rate: 1e-3,
-            gamma: 0.95,
-            tau: 0.01,
-            batch: None,
-            grad_clip: 0.5,
-            action_penalty: 1e-6,
-            messages: Messages::Observation,
-            actor_step: ActorStep::Joint,
-            masks: Masks::Kept,
-        }
-    }
-}
 
 /// A minibatch of B transitions; O and A are all learners' observation and action widths together.
 #[derive(Clone, Debug, Default)]

@@ -4,12 +4,14 @@
 //! algorithm: write `algo/<name>.rs` top to bottom, then its presets.
 
 mod actors;
+mod config;
 mod maddpg;
 mod presets;
 mod team;
 
 pub use actors::{Actors, RunPolicyError};
-pub use maddpg::{ActorStep, Batch, Maddpg, MaddpgConfig, Masks, Messages, UpdateMetrics};
+pub use config::{ActorStep, MaddpgConfig, Masks, Messages};
+pub use maddpg::{Batch, Maddpg, UpdateMetrics};
 pub use presets::Preset;
 pub use team::{Team, TeamScratch};
 

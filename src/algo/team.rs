@@ -183,7 +183,7 @@ mod tests {
                     input.clear();
                     actors.push_input(i, &observations[row * 12..], &link[row * 9..], &mut input);
                     let alone = actors.act(&params, i, &input, 1, &mut tape);
-                    let among = &scratch.actions(i)[row * (1 + i)..][..1 + i];
+                    let among = &scratch.actions(i)[row * (1 + i)..][..=i];
                     assert_eq!(single.actions(i), among, "row {row}, actor {i}: alone and among others");
                     for (a, b) in alone.iter().zip(among) {
                         assert!((a - b).abs() < 1e-6, "row {row}, actor {i}: {a} and {b}");

@@ -116,8 +116,7 @@ impl Operation for Step<'_> {
         let n = self.params.len();
         assert!([self.grads.len(), self.m.len(), self.v.len()] == [n; 3]);
         assert!(self.target.is_empty() || self.target.len() == n);
-        let [params, m, v, target] =
-            [&mut self.params, &mut self.m, &mut self.v, &mut self.target].map(|slice| std::mem::take(slice));
+        let [params, m, v, target] = [&mut self.params, &mut self.m, &mut self.v, &mut self.target].map(std::mem::take);
         let follows = !target.is_empty();
         let whole = n - n % S::WIDTH;
         for at in (0..whole).step_by(S::WIDTH) {

@@ -86,6 +86,9 @@ impl Operation for SlidingDots<'_> {
     }
 }
 
+/// Features that share what is read of g; more would not fit 16 registers.
+const TOGETHER: usize = 4;
+
 /// `out[f][i] = Σ_s g[s][i + g_offsets[s]] b[f][i + b_offsets[s]]` for i in `0..n`, n rounded up to whole vectors.
 pub(crate) struct SlidingSums<'a> {
     pub(crate) n: usize,
@@ -109,8 +112,6 @@ impl Operation for SlidingSums<'_> {
         self.g_offsets.iter().for_each(|&at| self.g.check(self.g_offsets.len(), at, n));
         self.b_offsets.iter().for_each(|&at| self.b.check(self.features, at, n));
         assert!(n <= self.out_stride && self.out.len() >= self.features * self.out_stride);
-        // few features at a time share what is read of g; more would not fit 16 registers
-        const TOGETHER: usize = 4;
         for f in (0..self.features).step_by(TOGETHER) {
             let together = TOGETHER.min(self.features - f);
             for i in (0..n).step_by(S::WIDTH) {

@@ -244,7 +244,7 @@ mod tests {
         let read = || -> std::io::Result<_> {
             let dir = tempfile::tempdir()?;
             let path = dir.path().join("t.csv");
-            std::fs::File::create(&path).and_then(|mut file| std::io::Write::write_all(&mut file, text.as_bytes()))?;
+            File::create(&path).and_then(|mut file| std::io::Write::write_all(&mut file, text.as_bytes()))?;
             Ok(read_trace(&path).map_err(|e| e.to_string().replace(path.to_string_lossy().as_ref(), "t.csv")))
         };
         read().map_err(|e| e.to_string())?

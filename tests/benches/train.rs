@@ -5,8 +5,10 @@
 //! what training does per 100 steps: the minibatch drawn, the Du-MIE trained and evaluated, critic, actors, targets.
 #![expect(clippy::unwrap_used, clippy::print_stdout, reason = "a benchmark prints, and panics where it cannot start")]
 
+mod cpu;
+
 use std::fmt::Write as _;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use ccmarl::algo::{ActorStep, Batch, Maddpg, MaddpgConfig, Messages};
 use ccmarl::io::write_atomic;
@@ -176,22 +178,12 @@ fn best(mut work: impl FnMut()) -> f64 {
 
 /// Seconds of CPU time per call, over a measurement.
 fn per_call(mut work: impl FnMut()) -> f64 {
-    let (start, mut calls) = (cpu_seconds(), 0);
-    while cpu_seconds() - start < LONG {
+    let (start, mut calls) = (cpu::seconds(), 0);
+    while cpu::seconds() - start < LONG {
         for _ in 0..20 {
             work();
         }
         calls += 20;
     }
-    (cpu_seconds() - start) / f64::from(calls)
-}
-
-/// Seconds of CPU time of this process's first thread where Linux tells it, else of the clock.
-fn cpu_seconds() -> f64 {
-    static START: std::sync::OnceLock<Instant> = std::sync::OnceLock::new();
-    let told = std::fs::read_to_string("/proc/self/schedstat").ok();
-    match told.and_then(|text| text.split(' ').next()?.parse().ok()) {
-        Some(nanoseconds) => Duration::from_nanos(nanoseconds).as_secs_f64(),
-        None => START.get_or_init(Instant::now).elapsed().as_secs_f64(),
-    }
+    (cpu::seconds() - start) / f64::from(calls)
 }

@@ -5,6 +5,8 @@
 //! of cost against number of agents.
 #![expect(clippy::unwrap_used, clippy::print_stdout, reason = "a benchmark prints, and panics where it cannot start")]
 
+mod cpu;
+
 use std::fmt::Write as _;
 
 use ccmarl::figure::{Curve, Data, FIGURES, Point, svg};
@@ -99,6 +101,3 @@ fn measure(spec: &Spec, count: usize) -> f64 {
     assert!(observations.iter().chain(&rewards).all(|v| v.is_finite()));
     1.0 / best
 }
-
-#[path = "cpu.rs"]
-mod cpu;

@@ -164,7 +164,8 @@ fn acting_allocates_nothing_once_it_is_warm() {
     acting.load_forward(&trained.actors, &params);
     let (observations, link) = (vec![0.5; 5 * 54], [false; 45]);
     acting.act(&trained.actors, &observations, &link, 5, &mut scratch);
-    let counted = crate::allocations::allocations(|| acting.act(&trained.actors, &observations, &link, 5, &mut scratch));
+    let counted =
+        crate::allocations::allocations(|| acting.act(&trained.actors, &observations, &link, 5, &mut scratch));
     assert_eq!(counted, 0);
 }
 
