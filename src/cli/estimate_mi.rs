@@ -30,6 +30,9 @@ In a CSV an empty cell and NaN are missing. The rows mean:
   jsd-plugin     the same critic's estimate of the information, nats
   jsd-nwj, -dv   lower bounds by the same critic, nats; jsd-certified: what the JSD alone proves
   club           upper bound, nats, often several times the truth; club-l1out: a tighter one
+  infonce, nwj   lower bounds by a critic of their own, nats; infonce at most ln K; mine: Donsker-Varadhan;
+  mine, smile    smile: clipped, an estimate; nwj:concatenated scores x and y side by side
+  l1out          the tighter upper bound alone; club-sample: club with one negative
   club-fit       how much better club's density fits than the margin; near 0 it bounds nothing
   gaussian       exact for normal data, bias-corrected, nats; gcmi: the same after ranks made every column normal
   ksg1, ksg2     nearest neighbours, no model, nats; ksg-mixed: for ties and discrete beside continuous columns

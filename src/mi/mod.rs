@@ -6,10 +6,14 @@
 //! Adding an estimator: write `mi/<name>.rs` with an `ENTRY`, and add `mod <name>;` and `<name>::ENTRY,` below. The
 //! rest of the room is protocol: `prepare` (standardised, split by episode), `fit` (training, stopped on validation),
 //! `interval` (episodes as blocks), `null` (whole episodes permuted), `part` (parts of the samples by whole episodes),
-//! `run` (all jobs in parallel); and arithmetic: `linear` (covariances), `knn` and `neighbours`, `counts`.
+//! `run` (all jobs in parallel); and what several share: `critic`,
+//! `scorer`, `bounds` and `contrast` (trained critics), `linear` (covariances), `knn` and `neighbours`, `counts`.
 
+mod bounds;
 mod club;
+mod club_sample;
 pub mod conditional;
+mod contrast;
 mod counts;
 pub mod critic;
 mod discrete;
@@ -17,20 +21,26 @@ mod estimate;
 mod fit;
 mod gaussian;
 mod gcmi;
+mod infonce;
 mod interval;
 mod jsd;
 mod knn;
 mod ksg1;
 mod ksg2;
 mod ksg_mixed;
+mod l1out;
 mod linear;
 pub mod losses;
+mod mine;
 mod negatives;
 mod neighbours;
 mod null;
+mod nwj;
 mod part;
 mod prepare;
 mod run;
+mod scorer;
+mod smile;
 
 pub use estimate::{Estimate, Kind, Unit, to_csv, to_json, to_parquet};
 pub use interval::{Interval, block_interval};
@@ -47,14 +57,20 @@ use crate::schema::Samples;
 /// All estimators.
 pub const ESTIMATORS: &[Entry<Build>] = &[
     club::ENTRY,
+    club_sample::ENTRY,
     discrete::ENTRY,
     gaussian::ENTRY,
     gcmi::ENTRY,
+    infonce::ENTRY,
     jsd::ENTRY,
     ksg1::USUAL,
     ksg1::ENTRY,
     ksg2::ENTRY,
     ksg_mixed::ENTRY,
+    l1out::ENTRY,
+    mine::ENTRY,
+    nwj::ENTRY,
+    smile::ENTRY,
 ];
 
 /// Makes an estimator from its parameters.
