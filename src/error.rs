@@ -53,6 +53,7 @@ impl Error {
             Self::Pairs(error) => error.is_usage(),
             Self::Registry(e) | Self::Train(TrainError::Registry(e)) => !matches!(e, RegistryError::Data(_)),
             Self::Usage(_)
+            | Self::Mi(MiError::Words { .. } | MiError::Given)
             | Self::Record(RecordError::NoEpisodes)
             | Self::Report(ReportError::NoInput)
             | Self::Storage(StorageError::Extension { .. })

@@ -6,6 +6,7 @@ mod convert;
 mod estimate_mi;
 mod evaluate;
 mod generate;
+mod heatmap;
 mod inspect;
 mod list;
 mod pairs;

@@ -7,7 +7,7 @@
 //! rest of the room is protocol: `prepare` (standardised, split by episode), `fit` (training, stopped on validation),
 //! `interval` (episodes as blocks), `null` (whole episodes permuted), `part` (parts of the samples by whole episodes),
 //! `run` (all jobs in parallel); and what several share: `critic`,
-//! `scorer`, `bounds` and `contrast` (trained critics), `linear` (covariances), `knn` and `neighbours`, `counts`.
+//! `scorer`, `bounds` and `contrast` (trained critics), `linear` (covariances), `given` (z), `knn` and `neighbours`, `counts`.
 
 mod bounds;
 mod club;
@@ -21,6 +21,7 @@ mod estimate;
 mod fit;
 mod gaussian;
 mod gcmi;
+mod given;
 mod infonce;
 mod interval;
 mod jsd;
@@ -83,6 +84,22 @@ pub trait Estimator: Send + Sync {
     /// # Errors
     /// [`MiError`] when the samples cannot carry the estimate.
     fn estimate(&self, samples: &Samples, protocol: &Protocol, seeds: &Seeds) -> Result<Vec<Estimate>, MiError>;
+
+    /// Whether it knows what to do with columns of words.
+    fn takes_words(&self) -> bool {
+        false
+    }
+
+    /// Whether it estimates the information given z.
+    fn takes_given(&self) -> bool {
+        false
+    }
+}
+
+/// Names of the estimators of which `takes` holds: what an error recommends.
+fn taking(takes: fn(&dyn Estimator) -> bool) -> String {
+    let built = ESTIMATORS.iter().filter_map(|e| Some((e.name, (e.build)(&Spec::new(e.name)).ok()?)));
+    built.filter(|(_, e)| takes(&**e)).map(|(name, _)| name).collect::<Vec<_>>().join(", ")
 }
 
 /// What all estimators hold to.
@@ -128,6 +145,15 @@ pub enum MiError {
         /// Which columns.
         column: String,
     },
+    /// Words, and an estimator that needs numbers.
+    #[error("{columns} holds words, not numbers: name other columns, or take one of {}", taking(|e| e.takes_words()))]
+    Words {
+        /// Which columns.
+        columns: String,
+    },
+    /// z, and an estimator that has no use for it.
+    #[error("it estimates nothing given z: leave out --given, or take one of {}", taking(|e| e.takes_given()))]
+    Given,
     /// Training went astray.
     #[error("training did not give a finite value: look for extreme values in {columns}")]
     Diverged {

@@ -17,9 +17,8 @@ fn probe(rho: f64, episodes: usize, seed: u64) -> Samples {
         x.push(m);
         y.extend([rho * m + (1.0 - rho * rho).sqrt() * normal(&mut rng), normal(&mut rng)]);
     }
-    let columns = |data: Vec<f64>, names: &[&str]| {
-        Arc::new(Columns { data, names: names.iter().map(|&n| n.to_owned()).collect() })
-    };
+    let columns =
+        |data: Vec<f64>, names: &[&str]| Arc::new(Columns::new(data, names.iter().map(|&n| n.to_owned()).collect()));
     Samples {
         x: columns(x, &["m"]),
         y: columns(y, &["a0", "a1"]),
@@ -102,7 +101,7 @@ fn independent_wide_data_give_no_neural_bound_anything() {
     let mut rng = Seeds::new(8).stream("wide");
     let mut wide = |name: &str| {
         let names = (0..10).map(|i| format!("{name}{i}")).collect();
-        Arc::new(Columns { data: (0..10_000).map(|_| normal(&mut rng)).collect(), names })
+        Arc::new(Columns::new((0..10_000).map(|_| normal(&mut rng)).collect(), names))
     };
     (samples.x, samples.y) = (wide("x"), wide("y"));
     for row in rows(&[samples], &plan(&[&TRAINED[..], &CONCATENATED].concat(), 39, 1)) {
@@ -137,7 +136,7 @@ fn a_trend_that_all_episodes_share_is_no_dependence_for_the_permutation() {
     let trend = |columns: &Columns| {
         let width = columns.width();
         let data = columns.data.iter().enumerate().map(|(i, v)| v + (i / width % 25) as f64).collect();
-        Arc::new(Columns { data, names: columns.names.clone() })
+        Arc::new(Columns::new(data, columns.names.clone()))
     };
     samples.x = trend(&samples.x);
     samples.y = trend(&samples.y);
@@ -158,7 +157,7 @@ fn every_estimator_states_its_words_and_refuses_parameters_it_does_not_have() {
 fn too_few_episodes_and_constant_columns_are_errors_of_every_trained_estimator() {
     let few = probe(0.5, 9, 1);
     let mut constant = probe(0.5, 20, 1);
-    constant.x = Arc::new(Columns { data: vec![2.5; 500], names: vec!["m".to_owned()] });
+    constant.x = Arc::new(Columns::new(vec![2.5; 500], vec!["m".to_owned()]));
     for result in run(&[few, constant], &plan(&[&TRAINED[..], &CONCATENATED].concat(), 0, 1), &|| ()) {
         let error = result.rows.unwrap_err().to_string();
         let expected = ["needs at least 10 episodes to split by episode", "m is constant, so it can tell nothing"];
