@@ -59,6 +59,7 @@ impl Error {
                 !matches!(e, RegistryError::Data(_))
             }
             Self::Usage(_)
+            | Self::Mi(MiError::Words { .. } | MiError::Given)
             | Self::Record(RecordError::NoEpisodes | RecordError::LinkEnds { .. })
             | Self::Report(ReportError::NoInput)
             | Self::Train(

@@ -6,11 +6,10 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use clap::ValueHint;
 
-use super::Outcome;
 use super::args::end_on_signals;
-use super::ui::{self, Format};
+use super::{Outcome, heatmap, ui};
 use crate::Error;
-use crate::mi::{self, ESTIMATORS, Estimate, Job, JobResult, Kind, Plan, Protocol, Unit};
+use crate::mi::{self, ESTIMATORS, Estimate, Job, JobResult, Kind, Plan, Protocol};
 use crate::pairs::{self, PairsError, TableOptions};
 use crate::registry::{Spec, find};
 use crate::schema::{SampleLabels, Samples};
@@ -22,15 +21,23 @@ Examples:
   ccmarl estimate-mi data/tag.mcap --estimator jsd,club,gaussian --delivered
   ccmarl estimate-mi table.parquet --x a,b --y c --estimator gaussian,jsd --group subject
   ccmarl estimate-mi table.csv --x a --y b --estimator ksg,ksg:10,gcmi
+  ccmarl estimate-mi table.csv --x a --y b --given c --estimator gaussian,ksg --unit bits
+  ccmarl estimate-mi table.csv --all-pairs --estimator gcmi --plot pairs.svg
+  ccmarl estimate-mi table.csv --x 'regex:^obs_' --y action --time t --lag 0..10 --estimator ksg
+  ccmarl estimate-mi table.csv --x job --y city --estimator discrete --format csv
   ccmarl estimate-mi table.csv --x a --y b --time t --out result.json
 
 For a store: x is the message that the sender sent, y the action of the receiver at the same step, per ordered link,
 delivered and lost apart. Values are in nats unless the unit says jsd. p: episodes permuted.
-In a CSV an empty cell and NaN are missing. The rows mean:
+In a CSV an empty cell and NaN are missing. Columns of words are categories: discrete and ksg-mixed take them.
+The rows mean:
   jsd            2·JSD of the critic, 0 to 2 ln 2: a lower bound on its own scale, not nats
   jsd-plugin     the same critic's estimate of the information, nats
   jsd-nwj, -dv   lower bounds by the same critic, nats; jsd-certified: what the JSD alone proves
   club           upper bound, nats, often several times the truth; club-l1out: a tighter one
+  infonce, nwj   lower bounds by a critic of their own, nats; infonce at most ln K; mine: Donsker-Varadhan;
+  mine, smile    smile: clipped, an estimate; nwj:concatenated scores x and y side by side
+  l1out          the tighter upper bound alone; club-sample: club with one negative
   club-fit       how much better club's density fits than the margin; near 0 it bounds nothing
   gaussian       exact for normal data, bias-corrected, nats; gcmi: the same after ranks made every column normal
   ksg1, ksg2     nearest neighbours, no model, nats; ksg-mixed: for ties and discrete beside continuous columns
@@ -38,30 +45,39 @@ In a CSV an empty cell and NaN are missing. The rows mean:
 
 /// Arguments of `ccmarl estimate-mi`.
 #[derive(Debug, clap::Args)]
-#[command(after_help = EXAMPLES)]
+#[command(after_help = EXAMPLES, group(clap::ArgGroup::new("table").args(["x", "all_pairs"]).multiple(true)))]
 pub(super) struct Args {
-    /// A rollout store (directory, .mcap or .parquet), or with --x and --y any CSV or Parquet table
+    /// A rollout store (directory, .mcap or .parquet), or with --x and --y any CSV, TSV or Parquet table
     #[arg(value_name = "PATH", value_hint = ValueHint::AnyPath)]
     path: PathBuf,
     #[arg(long, value_name = "NAMES", value_delimiter = ',', default_value = "jsd,club,gaussian", help = estimators())]
     estimator: Vec<String>,
-    /// Table: columns of x, comma-separated
-    #[arg(long, value_name = "COLUMNS", value_delimiter = ',', requires = "y")]
+    /// Table: columns of x, comma-separated; regex:PATTERN stands for all columns that it matches
+    #[arg(long, value_name = "COLUMNS", value_delimiter = ',')]
     x: Vec<String>,
     /// Table: columns of y, comma-separated
     #[arg(long, value_name = "COLUMNS", value_delimiter = ',', requires = "x")]
     y: Vec<String>,
+    /// Table: every pair of the columns --x, or of all columns
+    #[arg(long, conflicts_with = "y")]
+    all_pairs: bool,
+    /// Rows from x to y, never across the edge of an episode: 3, or 0,1,5, or 0..10 (both ends included)
+    #[arg(long, value_name = "LAGS", default_value = "0", value_parser = lags)]
+    lag: Lags,
+    /// Table: columns of z; x and y are compared given z (gaussian, gcmi, ksg1, ksg-mixed, discrete)
+    #[arg(long, value_name = "COLUMNS", value_delimiter = ',', requires = "table")]
+    given: Vec<String>,
     /// Table: rows with the same value in this column are one episode
-    #[arg(long, value_name = "COLUMN", requires = "x")]
+    #[arg(long, value_name = "COLUMN", requires = "table")]
     group: Option<String>,
     /// Table: column that orders the rows; without --group all rows are one series, cut into blocks
-    #[arg(long, value_name = "COLUMN", requires = "x")]
+    #[arg(long, value_name = "COLUMN", requires = "table")]
     time: Option<String>,
     /// Store: delivered messages only
-    #[arg(long, conflicts_with_all = ["lost", "x"])]
+    #[arg(long, conflicts_with_all = ["lost", "table"])]
     delivered: bool,
     /// Store: lost messages only
-    #[arg(long, conflicts_with = "x")]
+    #[arg(long, conflicts_with = "table")]
     lost: bool,
     /// Permutations behind a p-value; 0 for none
     #[arg(long, value_name = "N", default_value_t = 199, value_parser = clap::value_parser!(u32).range(0..=100_000))]
@@ -72,14 +88,20 @@ pub(super) struct Args {
     /// Threads; 0 for one per core (the result does not depend on it)
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u16).range(0..=1024))]
     threads: u16,
+    /// Unit of the values that are information
+    #[arg(long, value_enum, default_value_t)]
+    unit: InUnit,
     /// How results are printed
     #[arg(long, value_enum, default_value_t)]
-    format: Format,
+    format: Form,
     /// Also write the rows to a .json, .csv or .parquet file
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     out: Option<PathBuf>,
-    /// Replace --out if it exists
-    #[arg(long, requires = "out")]
+    /// Draw the first estimator's values as a heat map of links, or of --all-pairs: a .svg or .png file
+    #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
+    plot: Option<PathBuf>,
+    /// Replace --out and --plot if they exist
+    #[arg(long)]
     force: bool,
     /// End with exit code 1 if any row carries a warning
     #[arg(long)]
@@ -95,6 +117,49 @@ fn estimators() -> String {
     )
 }
 
+/// Rows from x to y.
+type Lags = std::sync::Arc<[usize]>;
+
+/// Reads `3`, `0,1,5` or `0..10`.
+fn lags(text: &str) -> Result<Lags, String> {
+    let number = |text: &str| text.trim().parse::<usize>().ok().filter(|&lag| lag <= 1_000_000);
+    let mut out = Vec::new();
+    for part in text.split(',') {
+        let range = part.split_once("..").map_or((number(part), number(part)), |(a, b)| (number(a), number(b)));
+        match range {
+            (Some(first), Some(last)) if first <= last && last - first < 1000 => out.extend(first..=last),
+            _ => return Err("expected 3, 0,1,5 or 0..10".to_owned()),
+        }
+    }
+    out.sort_unstable();
+    out.dedup();
+    Ok(out.into())
+}
+
+/// The unit of values that are information.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+enum InUnit {
+    /// Nats.
+    #[default]
+    Nats,
+    /// Bits: nats over ln 2.
+    Bits,
+}
+
+/// How results are printed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+enum Form {
+    /// For people.
+    #[default]
+    Table,
+    /// One JSON array.
+    Json,
+    /// CSV with a header.
+    Csv,
+    /// A Parquet file.
+    Parquet,
+}
+
 /// A job that gave no rows, and why.
 type Failure = (Job, mi::MiError);
 
@@ -105,21 +170,34 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     end_on_signals()?;
     let plan = plan(args)?;
     let write = args.out.as_deref().map(|path| writer(path, &args.path, args.force)).transpose()?;
+    let plot = args.plot.as_deref().map(|path| heatmap::target(path, args.force)).transpose()?;
+    if plot.is_some() && !args.all_pairs && !args.x.is_empty() {
+        let message = "--plot draws a matrix: give --all-pairs, or a store".to_owned();
+        return Err(Error::Usage(message).into());
+    }
     let samples = samples(args)?;
     let threads = usize::from(args.threads);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().context("could not start threads")?;
     let bar = ui::progress((samples.len() * plan.estimators.len()) as u64, "estimating");
     let results = pool.install(|| mi::run(&samples, &plan, &|| bar.inc(1)));
     bar.finish_and_clear();
-    let (rows, failures) = split(results)?;
+    let (mut rows, failures) = split(results)?;
+    if args.unit == InUnit::Bits {
+        rows = rows.into_iter().map(Estimate::in_bits).collect();
+    }
     if let (Some(path), Some(write)) = (&args.out, write) {
         let bytes = write(&rows).map_err(anyhow::Error::msg)?;
         io::write_atomic(path, &bytes).map_err(Error::from)?;
         ui::say(&format!("wrote {} rows: {}", rows.len(), path.display()));
     }
+    if let Some(target) = plot {
+        heatmap::draw(&rows, target)?;
+    }
     match args.format {
-        Format::Json => ui::print_json(&rows)?,
-        Format::Table => print(&rows, &samples)?,
+        Form::Table => print(&rows, &samples)?,
+        Form::Json => ui::print_bytes(&mi::to_json(&rows).map_err(anyhow::Error::msg)?)?,
+        Form::Csv => ui::print_bytes(&mi::to_csv(&rows).map_err(anyhow::Error::msg)?)?,
+        Form::Parquet => ui::print_bytes(&mi::to_parquet(&rows).map_err(anyhow::Error::msg)?)?,
     }
     for (job, error) in &failures {
         ui::say(&format!("warning: no {} for {}: {error}", job.estimator, place(&job.labels)));
@@ -163,10 +241,27 @@ fn writer(path: &Path, input: &Path, force: bool) -> anyhow::Result<Write> {
 }
 
 fn samples(args: &Args) -> Result<Vec<Samples>, Error> {
+    let sets = unlagged(args)?;
+    let mut out = Vec::new();
+    for set in &sets {
+        for &lag in args.lag.iter() {
+            out.push(pairs::lagged(set, lag)?);
+        }
+    }
+    Ok(out)
+}
+
+fn unlagged(args: &Args) -> Result<Vec<Samples>, Error> {
     let path = &args.path;
-    if !args.x.is_empty() {
-        let options =
-            TableOptions { x: args.x.clone(), y: args.y.clone(), group: args.group.clone(), time: args.time.clone() };
+    if !args.x.is_empty() || args.all_pairs {
+        let (x, y, given) = (args.x.clone(), args.y.clone(), args.given.clone());
+        let options = TableOptions { x, y, given, group: args.group.clone(), time: args.time.clone() };
+        if args.all_pairs {
+            return Ok(pairs::all_pairs(path, &options)?);
+        }
+        if options.y.is_empty() {
+            return Err(Error::Usage("--x needs --y, or --all-pairs".to_owned()));
+        }
         return Ok(vec![pairs::table(path, &options)?]);
     }
     if !pairs::is_store(path)? {
@@ -208,8 +303,14 @@ fn class(delivered: bool) -> &'static str {
 /// `agent_0 → agent_1 delivered`, or `a,b → c`.
 fn place(labels: &SampleLabels) -> String {
     match (&labels.sender, &labels.receiver, labels.delivered) {
-        (Some(sender), Some(receiver), Some(delivered)) => format!("{sender} → {receiver} {}", class(delivered)),
-        _ => format!("{} ; {}", labels.x, labels.y),
+        (Some(sender), Some(receiver), Some(delivered)) => {
+            let lag = labels.y.rsplit_once("[+").map_or(String::new(), |(_, lag)| format!(" [+{lag}"));
+            format!("{sender} → {receiver} {}{lag}", class(delivered))
+        }
+        _ => match &labels.given {
+            Some(given) => format!("{} ; {} | {given}", labels.x, labels.y),
+            None => format!("{} ; {}", labels.x, labels.y),
+        },
     }
 }
 
@@ -223,10 +324,10 @@ fn print(rows: &[Estimate], samples: &[Samples]) -> anyhow::Result<()> {
     let mut warnings: BTreeMap<&str, Vec<String>> = BTreeMap::new();
     let mut lines = Vec::new();
     let mut places = rows.iter().map(|row| {
-        samples
-            .iter()
-            .map(|s| &s.labels)
-            .find(|l| (&l.sender, &l.receiver, l.delivered) == (&row.sender, &row.receiver, row.delivered))
+        samples.iter().map(|s| &s.labels).find(|l| {
+            (&l.x, &l.y, &l.sender, &l.receiver) == (&row.x, &row.y, &row.sender, &row.receiver)
+                && l.delivered == row.delivered
+        })
     });
     let mut before = String::new();
     for row in rows {
@@ -247,10 +348,7 @@ fn print(rows: &[Estimate], samples: &[Samples]) -> anyhow::Result<()> {
             row.estimator.clone(),
             value,
             interval.map_or_else(String::new, |(low, high)| format!("{} … {}", decimals(low), decimals(high))),
-            match row.unit {
-                Unit::Nats => "nats".to_owned(),
-                Unit::Jsd => "jsd".to_owned(),
-            },
+            row.unit.name().to_owned(),
             row.p_value.map_or_else(String::new, |p| format!("{p:.3}")),
             row.n.to_string(),
             format!("{:.0}", row.n_effective),

@@ -7,6 +7,7 @@ mod estimate_mi;
 mod evaluate;
 mod fit_link;
 mod generate;
+mod heatmap;
 mod inspect;
 mod link;
 mod list;

@@ -28,8 +28,16 @@ pub(super) struct BrokenPipe;
 /// # Errors
 /// [`BrokenPipe`] when the reader has left; the caller just ends.
 pub(super) fn print(text: &str) -> anyhow::Result<()> {
+    print_bytes(format!("{text}\n").as_bytes())
+}
+
+/// Writes a document to stdout as it is.
+///
+/// # Errors
+/// [`BrokenPipe`] when the reader has left; the caller just ends.
+pub(super) fn print_bytes(bytes: &[u8]) -> anyhow::Result<()> {
     let mut out = std::io::stdout().lock();
-    match writeln!(out, "{text}").and_then(|()| out.flush()) {
+    match out.write_all(bytes).and_then(|()| out.flush()) {
         Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Err(BrokenPipe.into()),
         other => Ok(other?),
     }

@@ -8,7 +8,7 @@
 //! Rows are senders, columns receivers; the scale is named by `Data::unit`. 1600 units wide, height by agents.
 //!
 //! # Parameters
-//! None; it reads `cells`. Panels and agents stand in order of first appearance.
+//! None; it reads `cells` and `axes`. Panels and agents stand in order of first appearance.
 //!
 //! # When it fails
 //! No cell has a finite value. Single cells without one are drawn empty.
@@ -107,10 +107,12 @@ impl Figure<'_> {
             area.draw_text(&style::label(receiver, 13), &style, at)?;
         }
         let axis = style::text(style::TICK, style::SOFT, HPos::Center, VPos::Top);
-        area.draw_text("receiver", &axis, (left + across / 2, ABOVE + down + 50))?;
+        let [rows, columns] = &self.data.axes;
+        let named = |usual: &str, given: &str| style::label(if given.is_empty() { usual } else { given }, 30);
+        area.draw_text(&named("receiver", columns), &axis, (left + across / 2, ABOVE + down + 50))?;
         let upright =
             style::text(style::TICK, style::SOFT, HPos::Center, VPos::Top).transform(FontTransform::Rotate270);
-        area.draw_text("sender", &upright, (left - LEFT + 12, ABOVE + down / 2))?;
+        area.draw_text(&named("sender", rows), &upright, (left - LEFT + 12, ABOVE + down / 2))?;
         for (s, sender) in self.senders.iter().enumerate() {
             let top = ABOVE + tall * s as i32;
             let style = style::text(tick, style::INK, HPos::Right, VPos::Center);

@@ -71,6 +71,8 @@ pub struct Data {
     pub references: Vec<Reference>,
     /// Values by sender and receiver.
     pub cells: Vec<Cell>,
+    /// What rows and columns of cells are; `sender` and `receiver` when empty.
+    pub axes: [String; 2],
 }
 
 /// One line of a curve figure; several curves may belong to one series (runs, when there are few seeds).
@@ -226,6 +228,7 @@ mod tests {
             bars: vec![bar("unrestricted", -80.0), bar("none", -120.0)],
             references: vec![Reference { label: "random".to_owned(), value: -200.0 }],
             cells: vec![cell("delivered", 0.4133), cell("lost", f64::NAN)],
+            axes: ["<b>".to_owned(), "\u{1}".to_owned()],
         }
     }
 

@@ -102,6 +102,27 @@ impl Model for Trainee {
 
 impl Estimator for Club {
     fn estimate(&self, samples: &Samples, protocol: &Protocol, seeds: &Seeds) -> Result<Vec<Estimate>, MiError> {
+        let fitted = Fitted::new(samples, seeds)?;
+        let p = fitted.held.p_value(samples, &fitted.data, *protocol, seeds);
+        let bound = fitted.held.contributions(&fitted.data.test);
+        Ok(vec![
+            fitted.row("club", Kind::UpperBound, &bound, p)?,
+            fitted.row("club-l1out", Kind::UpperBound, &fitted.held.leave_one_out(seeds), p)?,
+            fitted.row("club-fit", Kind::Estimate, &fitted.held.gain(&fitted.data), p)?,
+        ])
+    }
+}
+
+/// q fitted to the training part, on the held-out part.
+pub(super) struct Fitted<'a> {
+    samples: &'a Samples,
+    pub(super) data: Prepared,
+    pub(super) held: Held,
+    warnings: Vec<String>,
+}
+
+impl<'a> Fitted<'a> {
+    pub(super) fn new(samples: &'a Samples, seeds: &Seeds) -> Result<Self, MiError> {
         let data = prepare(samples, seeds)?;
         let mut model = Trainee {
             q: GaussianConditional::deep(data.x_width, data.y_width),
@@ -109,41 +130,45 @@ impl Estimator for Club {
             grad_mu: Vec::new(),
             grad_logvar: Vec::new(),
         };
-        let diverged = || MiError::Diverged { columns: format!("{} and {}", samples.labels.x, samples.labels.y) };
-        let Fit { params, .. } = fit(&mut model, &data, seeds).ok_or_else(diverged)?;
+        let Fit { params, .. } = fit(&mut model, &data, seeds).ok_or_else(|| diverged(samples))?;
         let held = Held::new(&mut model, &params, samples, &data);
-        let n = data.test.len();
         let fit_gain = block_interval(&held.gain(&data), &data.test_blocks);
-        let bound = block_interval(&held.contributions(&data.test), &data.test_blocks);
-        let leave_one_out = block_interval(&held.leave_one_out(seeds), &data.test_blocks);
         let mut warnings = data.warnings.clone();
         warnings.extend(tied(samples));
         if fit_gain.mean < -0.01 && fit_gain.high < 0.0 {
             warnings.push(format!("poor q: {:.3} nats worse than the margin on held-out episodes", -fit_gain.mean));
         }
-        let p = held.p_value(samples, &data, *protocol, seeds);
-        let rows = [
-            ("club", Kind::UpperBound, bound),
-            ("club-l1out", Kind::UpperBound, leave_one_out),
-            ("club-fit", Kind::Estimate, fit_gain),
-        ];
-        if rows.iter().any(|(.., of)| !of.mean.is_finite()) {
-            return Err(diverged());
+        Ok(Self { samples, data, held, warnings })
+    }
+
+    /// A row from the contributions of the test samples.
+    pub(super) fn row(
+        &self,
+        name: &str,
+        kind: Kind,
+        contributions: &[f64],
+        p: Option<f64>,
+    ) -> Result<Estimate, MiError> {
+        let of = block_interval(contributions, &self.data.test_blocks);
+        if !of.mean.is_finite() {
+            return Err(diverged(self.samples));
         }
-        let row = |(name, kind, of): (&str, Kind, super::Interval)| {
-            let mut row = Estimate::new(name, &samples.labels, of.mean, Unit::Nats, kind, n);
-            (row.interval_low, row.interval_high) = (Some(of.low), Some(of.high));
-            row.n_effective = of.n_effective;
-            row.p_value = p;
-            row.warnings.clone_from(&warnings);
-            row
-        };
-        Ok(rows.into_iter().map(row).collect())
+        let n = self.data.test.len();
+        let mut row = Estimate::new(name, &self.samples.labels, of.mean, Unit::Nats, kind, n);
+        (row.interval_low, row.interval_high) = (Some(of.low), Some(of.high));
+        row.n_effective = of.n_effective;
+        row.p_value = p;
+        row.warnings.clone_from(&self.warnings);
+        Ok(row)
     }
 }
 
+fn diverged(samples: &Samples) -> MiError {
+    MiError::Diverged { columns: format!("{} and {}", samples.labels.x, samples.labels.y) }
+}
+
 /// q on every row of the test episodes, and the test part's y.
-struct Held {
+pub(super) struct Held {
     /// Where a row stands below.
     place: Vec<u32>,
     mu: Vec<f32>,
@@ -203,7 +228,8 @@ impl Held {
         self.y.chunks_exact(self.width).zip(rows).map(value).collect()
     }
 
-    fn log_q(&self, i: usize, row: u32) -> f64 {
+    /// ln q of test sample i's y beside row `row`'s x.
+    pub(super) fn log_q(&self, i: usize, row: u32) -> f64 {
         let (y, at) = (&self.y[i * self.width..(i + 1) * self.width], self.row(row));
         let parts = y.iter().zip(&self.mu[at.clone()]).zip(&self.logvar[at]);
         parts.map(|((&y, &mu), &logvar)| losses::log_normal(mu, logvar, y)).sum()
@@ -216,7 +242,7 @@ impl Held {
         rows.map(|(i, (y, &r))| self.log_q(i, r) - margin(y)).collect()
     }
 
-    fn leave_one_out(&self, seeds: &Seeds) -> Vec<f64> {
+    pub(super) fn leave_one_out(&self, seeds: &Seeds) -> Vec<f64> {
         let n = self.test.len();
         let others = (n - 1).min(OTHERS);
         // each sample meets the next ones in one random circle: never itself, all equally often
@@ -244,7 +270,7 @@ impl Held {
         values
     }
 
-    fn p_value(&self, samples: &Samples, data: &Prepared, protocol: Protocol, seeds: &Seeds) -> Option<f64> {
+    pub(super) fn p_value(&self, samples: &Samples, data: &Prepared, protocol: Protocol, seeds: &Seeds) -> Option<f64> {
         let statistic = |rows: &[u32]| self.contributions(rows).iter().sum::<f64>();
         let mut rng = seeds.stream("null");
         let null: Vec<f64> = (0..protocol.permutations)

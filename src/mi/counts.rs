@@ -30,6 +30,19 @@ impl Categories {
         out
     }
 
+    /// Both at once.
+    pub(super) fn joined(&self, other: &Self) -> Self {
+        let pair = |(&a, &b): (&u32, &u32)| u64::from(a) * other.count as u64 + u64::from(b);
+        Self::numbered(&self.of.iter().zip(&other.of).map(pair).collect::<Vec<_>>())
+    }
+
+    /// The places in `rows` of each category.
+    pub(super) fn cells(&self, rows: &[u32]) -> Vec<Vec<u32>> {
+        let mut out = vec![Vec::new(); self.count];
+        rows.iter().zip(0..).for_each(|(&r, place)| out[self.of[r as usize] as usize].push(place));
+        out
+    }
+
     fn numbered(keys: &[u64]) -> Self {
         let mut levels = keys.to_vec();
         levels.sort_unstable();
@@ -112,7 +125,7 @@ mod tests {
 
     fn columns(rows: &[&[f64]]) -> Columns {
         let names = (0..rows[0].len()).map(|i| i.to_string()).collect();
-        Columns { data: rows.concat(), names }
+        Columns::new(rows.concat(), names)
     }
 
     #[test]

@@ -5,7 +5,8 @@
 //! # Definition
 //!
 //! `discrete` = Σ p̂(x,y) ln \[p̂(x,y)/p̂(x)p̂(y)\], the plug-in value. `discrete-mm` = `discrete` − (`K_xy` − `K_x` − `K_y` + 1)/2n
-//! (Miller, Madow), K the categories that occur.
+//! (Miller, Madow), K the categories that occur. Given z: Σ p̂(x,y,z) ln \[p̂(x,y,z) p̂(z)/p̂(x,z) p̂(y,z)\], less (`K_xyz` − `K_xz` −
+//! `K_yz` + `K_z`)/2n.
 //!
 //! # Shapes and units
 //!
@@ -15,7 +16,7 @@
 //!
 //! None. Both rows carry the same interval, around `discrete-mm`: its error is the spread of the local terms over
 //! whole episodes, joined with √((`K_xy` − `K_x` − `K_y` + 1)/2)/n, which remains when there is no dependence. The p-value
-//! permutes whole episodes.
+//! permutes whole episodes; given z, x within equal z, if every sample is its own episode.
 //!
 //! # When it fails
 //!
@@ -31,6 +32,7 @@
 //! None known: equal to the published values of small tables (`datasets/tables`).
 
 use super::counts::{Categories, Table};
+use super::given::NO_NULL;
 use super::interval::{block_interval, t_quantile};
 use super::part::Part;
 use super::{Build, Estimate, Estimator, Kind, MiError, Protocol, Unit, p_value};
@@ -65,18 +67,36 @@ impl Estimator for Discrete {
             return Err(MiError::TooFewSamples { needed: 2, widths, found: n });
         }
         let (x, y) = (Categories::new(&samples.x), Categories::new(&samples.y));
-        let table = Table::new(&x, &y, rows, rows);
-        let [distinct_x, distinct_y] = table.occurring();
+        let [distinct_x, distinct_y] = Table::new(&x, &y, rows, rows).occurring();
         for (distinct, label) in [(distinct_x, &labels.x), (distinct_y, &labels.y)] {
             if distinct == 1 {
                 return Err(MiError::Constant { column: label.clone() });
             }
         }
-        let (value, bias) = (table.information(), table.degrees() / (2.0 * n as f64));
-        let local = block_interval(&table.local(&x, &y, rows, rows), &samples.episodes());
+        // I(x; y | z) = I(xz; yz) − H(z), and where x keeps its z, the pairs of xz and yz are the triples
+        let z = samples.z.as_deref().map(Categories::new);
+        let (x, y) = z.as_ref().map_or((x.clone(), y.clone()), |z| (x.joined(z), y.joined(z)));
+        let table = Table::new(&x, &y, rows, rows);
+        let of_z = z.as_ref().map(|z| Table::new(z, z, rows, rows));
+        let entropy = of_z.as_ref().map_or(0.0, Table::information);
+        let strata = of_z.as_ref().map_or(1, |of_z| of_z.occurring()[0]);
+        let (value, degrees) = (table.information() - entropy, table.degrees() + (strata - 1) as f64);
+        let bias = degrees / (2.0 * n as f64);
+        let mut terms = table.local(&x, &y, rows, rows);
+        if let (Some(of_z), Some(z)) = (&of_z, &z) {
+            terms.iter_mut().zip(of_z.local(z, z, rows, rows)).for_each(|(t, h)| *t -= h);
+        }
+        let local = block_interval(&terms, &samples.episodes());
         let all = Part::all(samples);
-        let null = all.null(samples, *protocol, seeds, &|from| Table::new(&x, &y, from, rows).information());
+        let information = |from: &[u32]| Table::new(&x, &y, from, rows).information();
         let mut warnings = samples.notes.clone();
+        let null = match &z {
+            None => Some(all.null(samples, *protocol, seeds, &information)),
+            Some(z) => all.null_within(&z.cells(rows), *protocol, seeds, &information),
+        };
+        if null.is_none() {
+            warnings.push(NO_NULL.to_owned());
+        }
         for (distinct, label) in [(distinct_x, &labels.x), (distinct_y, &labels.y)] {
             if distinct > 20 && distinct * 2 > n {
                 warnings.push(format!("{label} has {distinct} values in {n} samples: take ksg for continuous columns"));
@@ -90,12 +110,12 @@ impl Estimator for Discrete {
         if local.blocks < 10 {
             warnings.push(format!("few blocks: the interval rests on {} episodes", local.blocks));
         }
-        let remains = libm::sqrt(table.degrees().max(0.0) / 2.0) / n as f64;
+        let remains = libm::sqrt(degrees.max(0.0) / 2.0) / n as f64;
         let half = libm::hypot(local.error, remains) * t_quantile(local.blocks);
         let row = |name: &str, value: f64| {
             let mut row = Estimate::new(name, labels, value, Unit::Nats, Kind::Estimate, n);
             row.n_effective = local.n_effective;
-            row.p_value = p_value(table.information(), &null);
+            row.p_value = p_value(table.information(), null.as_deref().unwrap_or_default());
             if local.blocks > 1 {
                 (row.interval_low, row.interval_high) =
                     (Some(local.mean - bias - half), Some(local.mean - bias + half));
@@ -104,6 +124,14 @@ impl Estimator for Discrete {
             row
         };
         Ok(vec![row("discrete", value), row("discrete-mm", value - bias)])
+    }
+
+    fn takes_words(&self) -> bool {
+        true
+    }
+
+    fn takes_given(&self) -> bool {
+        true
     }
 }
 
@@ -156,6 +184,39 @@ mod tests {
         assert_eq!(constant.unwrap_err(), MiError::Constant { column: "y".to_owned() });
         let one = Discrete.estimate(&samples_of(&x[..1], &y[..1]), &Protocol::default(), &Seeds::new(1));
         assert_eq!(one.unwrap_err(), MiError::TooFewSamples { needed: 2, widths: 2, found: 1 });
+    }
+
+    #[test]
+    fn given_z_a_parity_appears_and_a_common_cause_disappears() {
+        let mut rng = Seeds::new(9).stream("bits");
+        let mut bits = |n: usize| (0..n).map(|_| rng::below(&mut rng, 2) as u32).collect::<Vec<_>>();
+        let (a, b) = (bits(2000), bits(2000));
+        let parity: Vec<u32> = a.iter().zip(&b).map(|(a, b)| a ^ b).collect();
+        let mut samples = samples_of(&column(&a), &column(&b));
+        samples.z = Some(samples_of(&column(&parity), &column(&parity)).x);
+        let [plug_in, corrected] = both(&samples);
+        // H(a | parity), by the counts themselves
+        let count = |f: &dyn Fn(usize) -> bool| (0..2000).filter(|&i| f(i)).count() as f64;
+        let mut entropy = 0.0;
+        for (s, t) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+            let (both, alone) = (count(&|i| a[i] == s && parity[i] == t), count(&|i| parity[i] == t));
+            entropy -= both / 2000.0 * (both / alone).ln();
+        }
+        assert!((plug_in.value - entropy).abs() < 1e-12, "{} against {entropy}", plug_in.value);
+        // 4 triples, 4 and 4 pairs, 2 strata: −2/2n
+        assert!((corrected.value - plug_in.value - 2.0 / 4000.0).abs() < 1e-12);
+        assert_eq!(plug_in.p_value, Some(0.01));
+        // both are noisy copies of the parity: dependent, but not given it
+        let noisy = |seed: u64| {
+            let mut rng = Seeds::new(seed).stream("noise");
+            parity.iter().map(|&p| p ^ u32::from(rng::bernoulli(&mut rng, 0.2))).collect::<Vec<_>>()
+        };
+        let copies = samples_of(&column(&noisy(1)), &column(&noisy(2)));
+        (samples.x, samples.y) = (copies.x, copies.y);
+        let [given, corrected] = both(&samples);
+        assert!(corrected.value.abs() < 0.003 && given.p_value.unwrap() > 0.02, "{given:?}");
+        samples.z = None;
+        assert!(both(&samples)[1].value > 0.05);
     }
 
     /// n pairs of binary symbols, y equal to x but for a share `flip`; three symbols when `flip` is one half.

@@ -1,5 +1,6 @@
 //! The output row, and its three file forms.
 
+use std::f64::consts::LN_2;
 use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::Path;
@@ -46,6 +47,8 @@ impl Kind {
 pub enum Unit {
     /// Nats of mutual information.
     Nats,
+    /// Bits: nats over ln 2.
+    Bits,
     /// 2·JSD, in \[0, 2 ln 2\].
     Jsd,
 }
@@ -55,6 +58,7 @@ impl Unit {
     pub fn name(self) -> &'static str {
         match self {
             Self::Nats => "nats",
+            Self::Bits => "bits",
             Self::Jsd => "jsd",
         }
     }
@@ -121,6 +125,20 @@ impl Estimate {
             n_effective: n as f64,
             warnings: Vec::new(),
         }
+    }
+}
+
+impl Estimate {
+    /// The same in bits, if it is in nats.
+    #[must_use]
+    pub fn in_bits(mut self) -> Self {
+        if self.unit == Unit::Nats {
+            self.unit = Unit::Bits;
+            self.value /= LN_2;
+            self.interval_low = self.interval_low.map(|v| v / LN_2);
+            self.interval_high = self.interval_high.map(|v| v / LN_2);
+        }
+        self
     }
 }
 
@@ -232,6 +250,14 @@ mod tests {
         let csv = String::from_utf8(to_csv(&[row.clone()]).unwrap()).unwrap();
         assert_eq!(csv.lines().next().unwrap(), keys.replace(' ', ","));
         assert!(csv.contains("one; two"), "{csv}");
-        assert_eq!(&to_parquet(&[row]).unwrap()[..4], b"PAR1");
+        assert_eq!(&to_parquet(&[row.clone()]).unwrap()[..4], b"PAR1");
+        (row.value, row.interval_low) = (2.0 * LN_2, Some(LN_2));
+        let bits = row.in_bits();
+        assert_eq!(
+            (bits.value, bits.interval_low, bits.interval_high, bits.unit.name()),
+            (2.0, Some(1.0), None, "bits")
+        );
+        let jsd = Estimate::new("jsd", &labels, 0.5, Unit::Jsd, Kind::LowerBound, 7);
+        assert_eq!(jsd.clone().in_bits(), jsd);
     }
 }

@@ -6,7 +6,8 @@
 //! # Definition
 //!
 //! I = ½ \[ln |`S_x`| + ln |`S_y`| − ln |`S_xy`|\] with S the sample covariances, less its bias for normal samples,
-//! ½ \[`b(d_x)` + `b(d_y)` − `b(d_x` + `d_y`)\], b(d) = Σ_{i=1..d} ψ((n − i)/2), ψ the digamma function.
+//! ½ \[`b(d_x)` + `b(d_y)` − `b(d_x` + `d_y`)\], b(d) = Σ_{i=1..d} ψ((n − i)/2), ψ the digamma function. Given z: the same of what a
+//! linear regression on z leaves of x and y, with n less the columns of z in b.
 //!
 //! # Shapes and units
 //!
@@ -31,6 +32,7 @@
 
 use statrs::function::gamma::digamma;
 
+use super::given::residuals;
 use super::interval::{block_interval, t_quantile};
 use super::knn::Points;
 use super::linear::{Moments, Symmetric};
@@ -68,18 +70,24 @@ impl Estimator for Gaussian {
         row.warnings.extend(tied(samples));
         Ok(vec![row])
     }
+
+    fn takes_given(&self) -> bool {
+        true
+    }
 }
 
 /// The row of an estimator called `name`.
 pub(super) fn estimate(name: &str, samples: &Samples, protocol: Protocol, seeds: &Seeds) -> Result<Estimate, MiError> {
     let (mut warnings, labels) = (samples.notes.clone(), &samples.labels);
+    let (samples, given) = &residuals(samples, &mut warnings)?;
     let x = Scaled::new(&samples.x, samples, &labels.x, &mut warnings)?;
     let y = Scaled::new(&samples.y, samples, &labels.y, &mut warnings)?;
     let (dx, dy, n) = (x.columns.len(), y.columns.len(), samples.len());
-    let needed = (2 * (dx + dy)).max(10);
+    let needed = (2 * (dx + dy + given)).max(10);
     if n < needed {
-        return Err(MiError::TooFewSamples { needed, widths: dx + dy, found: n });
+        return Err(MiError::TooFewSamples { needed, widths: dx + dy + given, found: n });
     }
+    let information = |moments: &Moments| information(moments, dx, dy, *given);
     let blocks = samples.episodes();
     let groups = groups(&blocks);
     let mut parts = vec![Moments::new(dx + dy); groups.last().map_or(0, |g| g + 1)];
@@ -94,12 +102,12 @@ pub(super) fn estimate(name: &str, samples: &Samples, protocol: Protocol, seeds:
     for part in &parts {
         total.add(part, 1.0);
     }
-    let value = information(&total, dx, dy);
+    let value = information(&total);
     let mut out = Estimate::new(name, labels, value, Unit::Nats, Kind::Estimate, n);
     if value.is_infinite() {
         warnings.push(copy(labels));
     } else {
-        interval(&mut out, &total, &parts, dx, dy);
+        interval(&mut out, &total, &parts, dx + dy + given, &information);
         let local = local_information(samples, &x, &y, &total);
         out.n_effective = block_interval(&local, &blocks).n_effective;
         if parts.len() < 10 {
@@ -114,7 +122,7 @@ pub(super) fn estimate(name: &str, samples: &Samples, protocol: Protocol, seeds:
             y.push(r, &mut row);
             moments.add_row(&row);
         }
-        information(&moments, dx, dy)
+        information(&moments)
     };
     let part = Part::all(samples);
     let null = part.null(samples, protocol, seeds, &statistic);
@@ -192,14 +200,15 @@ fn groups(blocks: &[u32]) -> Vec<usize> {
     blocks.iter().map(group).collect()
 }
 
-/// Bias-corrected information in nats; infinite when x determines a column of y.
-fn information(moments: &Moments, dx: usize, dy: usize) -> f64 {
+/// Bias-corrected information in nats; infinite when x determines a column of y. `given` columns of z have been taken
+/// out of x and y, and cost a degree of freedom each.
+fn information(moments: &Moments, dx: usize, dy: usize, given: usize) -> f64 {
     let joint = moments.covariance();
     let log_det = |pivots: &[f64]| pivots.iter().map(|&p| libm::log(p)).sum::<f64>();
     // the joint pivots start with those of x alone; what follows is y given x
     let pivots = joint.cholesky(COLLINEAR).pivots;
     let alone = joint.block(dx..dx + dy).cholesky(COLLINEAR).pivots;
-    let bias = |d: usize| (1..=d).map(|i| digamma((moments.n - i as f64) / 2.0)).sum::<f64>();
+    let bias = |d: usize| (1..=d).map(|i| digamma((moments.n - (given + i) as f64) / 2.0)).sum::<f64>();
     0.5 * (log_det(&alone) - log_det(&pivots[dx..]) - (bias(dx) + bias(dy) - bias(dx + dy)))
 }
 
@@ -220,14 +229,20 @@ fn local_information(samples: &Samples, x: &Scaled<'_>, y: &Scaled<'_>, total: &
 }
 
 /// Jackknife over the parts: error² = (G − 1)/G Σ (`θ_g` − θ̄)².
-fn interval(out: &mut Estimate, total: &Moments, parts: &[Moments], dx: usize, dy: usize) {
+fn interval(
+    out: &mut Estimate,
+    total: &Moments,
+    parts: &[Moments],
+    width: usize,
+    information: &dyn Fn(&Moments) -> f64,
+) {
     let g = parts.len() as f64;
     let left_out: Vec<f64> = parts
         .iter()
         .map(|part| {
             let mut rest = total.clone();
             rest.add(part, -1.0);
-            if rest.n > (dx + dy + 2) as f64 { information(&rest, dx, dy) } else { f64::NAN }
+            if rest.n > (width + 2) as f64 { information(&rest) } else { f64::NAN }
         })
         .collect();
     let mean = left_out.iter().sum::<f64>() / g;
@@ -258,6 +273,24 @@ mod tests {
             assert_eq!(found.p_value.unwrap() < 0.01, rho > 0.0);
             assert_eq!(found.n, 5000);
         }
+    }
+
+    #[test]
+    fn given_a_common_cause_nothing_is_left_and_given_noise_everything() {
+        // x = c + e, y = c + f: ½ ln 4/3 without z, 0 given c; x and y + x given nothing of use: unchanged
+        let noise = linear_samples(0.0, 4000, 3, 11);
+        let column = |of: fn(&[f64], &[f64]) -> f64| -> Vec<Vec<f64>> {
+            (0..4000).map(|r| vec![of(noise.x.row(r), noise.y.row(r))]).collect()
+        };
+        let mut samples = samples_of(&column(|a, b| a[0] + b[1]), &column(|a, b| a[0] + b[2]));
+        let plain = one(&samples);
+        assert!((plain.value - 0.5 * (4f64 / 3.0).ln()).abs() < 0.02, "{}", plain.value);
+        samples.z = Some(samples_of(&column(|a, _| a[0]), &column(|a, _| a[0])).x);
+        let common = one(&samples);
+        assert!(common.value.abs() < 0.002 && common.p_value.unwrap() > 0.01, "{common:?}");
+        samples.z = Some(samples_of(&column(|a, _| a[1]), &column(|a, _| a[0])).x);
+        let useless = one(&samples);
+        assert!((useless.value - plain.value).abs() < 0.005 && useless.p_value.unwrap() < 0.01, "{useless:?}");
     }
 
     #[test]

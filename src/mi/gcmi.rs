@@ -6,7 +6,7 @@
 //! # Definition
 //!
 //! Each column is replaced by Φ⁻¹(rank/(n + 1)), equal values having the mean of their ranks; then the bias-corrected
-//! log-determinants of `gaussian`.
+//! log-determinants of `gaussian`, given z too, whose columns are replaced likewise.
 //!
 //! # Shapes and units
 //!
@@ -59,11 +59,16 @@ fn build(spec: &Spec) -> Result<Box<dyn Estimator>, RegistryError> {
 impl Estimator for Gcmi {
     fn estimate(&self, samples: &Samples, protocol: &Protocol, seeds: &Seeds) -> Result<Vec<Estimate>, MiError> {
         let scores = |columns: &Columns| Arc::new(normal_scores(columns, &samples.rows));
-        let normal = Samples { x: scores(&samples.x), y: scores(&samples.y), ..samples.clone() };
+        let z = samples.z.as_deref().map(scores);
+        let normal = Samples { x: scores(&samples.x), y: scores(&samples.y), z, ..samples.clone() };
         let mut row = gaussian::estimate("gcmi", &normal, *protocol, seeds)?;
         row.kind = Kind::LowerBound;
         row.warnings.extend(tied(samples));
         Ok(vec![row])
+    }
+
+    fn takes_given(&self) -> bool {
+        true
     }
 }
 
@@ -83,7 +88,7 @@ pub(super) fn normal_scores(columns: &Columns, rows: &[u32]) -> Columns {
             to[c] = normal.inverse_cdf(rank / (n + 1.0));
         }
     }
-    Columns { data, names: columns.names.clone() }
+    Columns::new(data, columns.names.clone())
 }
 
 #[cfg(test)]
@@ -97,7 +102,7 @@ mod tests {
 
     #[test]
     fn scores_are_quantiles_of_mean_ranks() {
-        let columns = Columns { data: vec![5.0, -1.0, 5.0, 100.0, 7.0, 200.0], names: vec!["a".to_owned()] };
+        let columns = Columns::new(vec![5.0, -1.0, 5.0, 100.0, 7.0, 200.0], vec!["a".to_owned()]);
         let scores = normal_scores(&columns, &[0, 1, 2, 3]).data;
         let quantile = |p: f64| Normal::standard().inverse_cdf(p);
         // 7 lies between the samples, 200 above all of them
@@ -110,7 +115,7 @@ mod tests {
         let plain = linear_samples(0.75, 2000, 2, 3);
         let bent = |columns: &Columns| {
             let data = columns.data.iter().map(|v| v.exp() + 3.0 * v).collect();
-            Arc::new(Columns { data, names: columns.names.clone() })
+            Arc::new(Columns::new(data, columns.names.clone()))
         };
         let changed = Samples { x: bent(&plain.x), y: bent(&plain.y), ..plain.clone() };
         let (a, b) = (one(&plain), one(&changed));

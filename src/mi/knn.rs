@@ -101,6 +101,12 @@ impl Tree {
         self.build(2 * node + 2, points, right);
     }
 
+    /// The points' numbers, leaf by leaf.
+    pub(super) fn cells(&self) -> impl Iterator<Item = &[u32]> {
+        let leaves = self.numbers.iter().zip(&self.counts[self.leaves - 1..]);
+        leaves.map(|(numbers, &count)| &numbers[..count as usize])
+    }
+
     /// Distance of each point to its `k`-th nearest other one, `[n]`; infinite when there are fewer.
     pub(super) fn kth(&self, k: usize) -> Vec<f64> {
         self.per_point(f64::INFINITY, |tree, query| {

@@ -7,7 +7,7 @@
 //!
 //! I = ψ(k) + ψ(n) − mean\[ψ(`n_x` + 1) + ψ(`n_y` + 1)\]. ε is the distance from sample i to its k-th nearest other one
 //! in the maximum norm over all columns; `n_x` counts the others that are **closer** than ε in x, `n_y` in y; where ε = 0,
-//! those that are equal.
+//! those that are equal. Given z: I = ψ(k) − mean\[ψ(`n_xz` + 1) + ψ(`n_yz` + 1) − ψ(`n_z` + 1)\], ε over all columns of x, y and z.
 //!
 //! # Shapes and units
 //!
@@ -16,7 +16,8 @@
 //! # Parameters
 //!
 //! `k` ≥ 1, 3 by default: more lowers the variance and raises the bias. The interval is by subsampling whole episodes (at
-//! most 20,000 samples; 6,000 above four columns), the p-value permutes them (at most 4,000; 1,500).
+//! most 20,000 samples; 6,000 above four columns), the p-value permutes them (at most 4,000; 1,500). Given z, x is permuted
+//! within cells of at most sixteen samples with neighbouring z, if every sample is its own episode.
 //!
 //! # When it fails
 //!
@@ -26,7 +27,8 @@
 //!
 //! # Reference
 //!
-//! Kraskov, Stögbauer, Grassberger 2004, Phys. Rev. E 69, 066138, eq. 8; interval: Holmes, Nemenman 2019, arXiv 1903.09280.
+//! Kraskov, Stögbauer, Grassberger 2004, Phys. Rev. E 69, 066138, eq. 8; given z: Frenzel, Pompe 2007, Phys. Rev. Lett. 99,
+//! 204101; interval: Holmes, Nemenman 2019, arXiv 1903.09280.
 //!
 //! # Differences from the reference implementation
 //!
@@ -34,7 +36,7 @@
 //! ε = 0. Distances that differ by less than a billionth are equal. The value is never cut at 0.
 
 use super::knn::{Points, Tree, within};
-use super::neighbours::{Neighbours, closer_than, digammas};
+use super::neighbours::{Neighbours, closer_than, digammas, given_terms};
 use super::{Build, Estimate, Estimator, MiError, Protocol};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
@@ -58,12 +60,16 @@ pub(super) const USUAL: Entry<Build> =
 struct Ksg1(Neighbours);
 
 fn build(spec: &Spec) -> Result<Box<dyn Estimator>, RegistryError> {
-    Ok(Box::new(Ksg1(Neighbours::new("ksg1", spec, terms, false)?)))
+    Ok(Box::new(Ksg1(Neighbours::new("ksg1", spec, terms, Some(terms_given), false)?)))
 }
 
 impl Estimator for Ksg1 {
     fn estimate(&self, samples: &Samples, protocol: &Protocol, seeds: &Seeds) -> Result<Vec<Estimate>, MiError> {
         Ok(vec![self.0.row(samples, *protocol, seeds)?])
+    }
+
+    fn takes_given(&self) -> bool {
+        true
     }
 }
 
@@ -73,6 +79,12 @@ pub(super) fn terms(x: &Points, y: &Points, k: usize) -> Vec<f64> {
     let (n, psi) = (x.len(), digammas(x.len()));
     let of = |count: u32| psi[count as usize];
     within(x, &radii).into_iter().zip(within(y, &radii)).map(|(x, y)| psi[k] + psi[n] - of(x) - of(y)).collect()
+}
+
+/// Local terms given z.
+pub(super) fn terms_given(x: &Points, y: &Points, z: &Points, k: usize) -> Vec<f64> {
+    let radii: Vec<f64> = Tree::new(&Points::joined(&[x, y, z])).kth(k).into_iter().map(closer_than).collect();
+    given_terms([x, y, z], &radii, &digammas(x.len()), |_| k)
 }
 
 #[cfg(test)]

@@ -49,7 +49,7 @@ pub(super) const ENTRY: Entry<Build> = Entry {
 struct Ksg2(Neighbours);
 
 fn build(spec: &Spec) -> Result<Box<dyn Estimator>, RegistryError> {
-    Ok(Box::new(Ksg2(Neighbours::new("ksg2", spec, terms, false)?)))
+    Ok(Box::new(Ksg2(Neighbours::new("ksg2", spec, terms, None, false)?)))
 }
 
 impl Estimator for Ksg2 {

@@ -7,7 +7,8 @@
 //!
 //! I = mean\[ψ(`k_i`) + ln n − ψ(`c_x`) − ψ(`c_y`)\]. ε is the distance to the k-th nearest other sample, as for `ksg1`.
 //! Where ε > 0: `k_i` = k, and `c_x`, `c_y` count the samples closer than ε in x, in y, with sample i itself. Where ε = 0:
-//! `k_i`, `c_x`, `c_y` count the samples equal to i, with i itself, in all columns, in x, in y.
+//! `k_i`, `c_x`, `c_y` count the samples equal to i, with i itself, in all columns, in x, in y. Given z: I = mean\[ψ(`k_i`) +
+//! ψ(`c_z`) − ψ(`c_xz`) − ψ(`c_yz`)\].
 //!
 //! # Shapes and units
 //!
@@ -19,12 +20,14 @@
 //!
 //! # When it fails
 //!
-//! In many columns, as `ksg1`. Numbers that code categories get distances that mean nothing: with three or more
-//! categories in one column beside continuous ones, the code's order matters. For discrete columns alone, `discrete` is exact.
+//! In many columns, as `ksg1`. Numbers that code three or more categories get distances that mean nothing: leave them as
+//! words, which are far from each other, so that neighbours share them; a word of k or fewer samples borrows neighbours
+//! from the next in the alphabet. For discrete columns alone, `discrete` is exact.
 //!
 //! # Reference
 //!
-//! Gao, Kannan, Oh, Viswanath 2017, `NeurIPS`, arXiv 1709.06212.
+//! Gao, Kannan, Oh, Viswanath 2017, `NeurIPS`, arXiv 1709.06212; given z: Mesner, Shalizi 2021, IEEE Trans. Information
+//! Theory 67 (without its cut at 0).
 //!
 //! # Differences from the reference implementation
 //!
@@ -32,7 +35,7 @@
 //! billionth are equal (there: 1e-15), so that values on a decimal grid are tied although they are rounded.
 
 use super::knn::{Points, Tree, within};
-use super::neighbours::{Neighbours, closer_than, digammas, is_zero};
+use super::neighbours::{Neighbours, closer_than, digammas, given_terms, is_zero};
 use super::{Build, Estimate, Estimator, MiError, Protocol};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
@@ -50,12 +53,20 @@ pub(super) const ENTRY: Entry<Build> = Entry {
 struct KsgMixed(Neighbours);
 
 fn build(spec: &Spec) -> Result<Box<dyn Estimator>, RegistryError> {
-    Ok(Box::new(KsgMixed(Neighbours::new("ksg-mixed", spec, terms, true)?)))
+    Ok(Box::new(KsgMixed(Neighbours::new("ksg-mixed", spec, terms, Some(terms_given), true)?)))
 }
 
 impl Estimator for KsgMixed {
     fn estimate(&self, samples: &Samples, protocol: &Protocol, seeds: &Seeds) -> Result<Vec<Estimate>, MiError> {
         Ok(vec![self.0.row(samples, *protocol, seeds)?])
+    }
+
+    fn takes_words(&self) -> bool {
+        true
+    }
+
+    fn takes_given(&self) -> bool {
+        true
     }
 }
 
@@ -70,6 +81,15 @@ fn terms(x: &Points, y: &Points, k: usize) -> Vec<f64> {
     let ln = libm::log(n as f64);
     let neighbours = |i: usize| if is_zero(kth[i]) { equal[i] as usize } else { k };
     (0..n).map(|i| psi[neighbours(i)] + ln - psi[in_x[i] as usize] - psi[in_y[i] as usize]).collect()
+}
+
+fn terms_given(x: &Points, y: &Points, z: &Points, k: usize) -> Vec<f64> {
+    let tree = Tree::new(&Points::joined(&[x, y, z]));
+    let kth = tree.kth(k);
+    let radii: Vec<f64> = kth.iter().copied().map(closer_than).collect();
+    let equal = tree.within(&radii);
+    let neighbours = |i: usize| if is_zero(kth[i]) { equal[i] as usize } else { k };
+    given_terms([x, y, z], &radii, &digammas(x.len()), neighbours)
 }
 
 #[cfg(test)]

@@ -61,6 +61,12 @@ impl Symmetric {
         Self { width: columns.len(), data }
     }
 
+    /// The rows and columns of these numbers.
+    pub(super) fn picked(&self, columns: &[usize]) -> Self {
+        let data = columns.iter().flat_map(|&i| columns.iter().map(move |&j| self.data[i * self.width + j])).collect();
+        Self { width: columns.len(), data }
+    }
+
     /// Cholesky decomposition. A column whose pivot is under `least` times its variance gets 0 and is left out of what
     /// follows.
     pub(super) fn cholesky(&self, least: f64) -> Cholesky {
@@ -103,6 +109,24 @@ impl Cholesky {
             sum += z * z;
         }
         sum
+    }
+}
+
+impl Cholesky {
+    /// What the first `first` values of a row do not explain of the others; `scratch` is overwritten.
+    pub(super) fn unexplained<'a>(
+        &'a self,
+        row: &'a [f64],
+        first: usize,
+        scratch: &'a mut Vec<f64>,
+    ) -> impl Iterator<Item = f64> + 'a {
+        let w = self.pivots.len();
+        self.distance(row, scratch);
+        let scratch = &*scratch;
+        (first..w).map(move |c| {
+            let known: f64 = self.lower[c * w..c * w + first].iter().zip(scratch).map(|(l, s)| l * s).sum();
+            row[c] - known
+        })
     }
 }
 

@@ -6,11 +6,15 @@
 //! Adding an estimator: write `mi/<name>.rs` with an `ENTRY`, and add `mod <name>;` and `<name>::ENTRY,` below. The
 //! rest of the room is protocol: `prepare` (standardised, split by episode), `fit` (training, stopped on validation),
 //! `interval` (episodes as blocks), `null` (whole episodes permuted), `part` (parts of the samples by whole episodes),
-//! `run` (all jobs in parallel); and arithmetic: `linear` (covariances), `knn` and `neighbours`, `counts`.
+//! `run` (all jobs in parallel); and what several share: `critic`,
+//! `scorer`, `bounds` and `contrast` (trained critics), `linear` (covariances), `given` (z), `knn` and `neighbours`, `counts`.
 
 pub(crate) mod all_pairs;
+mod bounds;
 mod club;
+mod club_sample;
 pub mod conditional;
+mod contrast;
 mod counts;
 pub mod critic;
 mod discrete;
@@ -18,21 +22,28 @@ mod estimate;
 mod fit;
 mod gaussian;
 mod gcmi;
+mod given;
+mod infonce;
 mod interval;
 mod jsd;
 mod knn;
 mod ksg1;
 mod ksg2;
 mod ksg_mixed;
+mod l1out;
 mod linear;
 pub mod losses;
+mod mine;
 mod negatives;
 mod neighbours;
 mod null;
+mod nwj;
 mod part;
 mod prepare;
 mod run;
+mod scorer;
 pub(crate) mod shifted;
+mod smile;
 
 pub use estimate::{Estimate, Kind, Unit, is_estimates, to_csv, to_json, to_parquet};
 pub use interval::{Interval, block_interval};
@@ -49,14 +60,20 @@ use crate::schema::Samples;
 /// All estimators.
 pub const ESTIMATORS: &[Entry<Build>] = &[
     club::ENTRY,
+    club_sample::ENTRY,
     discrete::ENTRY,
     gaussian::ENTRY,
     gcmi::ENTRY,
+    infonce::ENTRY,
     jsd::ENTRY,
     ksg1::USUAL,
     ksg1::ENTRY,
     ksg2::ENTRY,
     ksg_mixed::ENTRY,
+    l1out::ENTRY,
+    mine::ENTRY,
+    nwj::ENTRY,
+    smile::ENTRY,
 ];
 
 /// Makes an estimator from its parameters.
@@ -69,6 +86,22 @@ pub trait Estimator: Send + Sync {
     /// # Errors
     /// [`MiError`] when the samples cannot carry the estimate.
     fn estimate(&self, samples: &Samples, protocol: &Protocol, seeds: &Seeds) -> Result<Vec<Estimate>, MiError>;
+
+    /// Whether it knows what to do with columns of words.
+    fn takes_words(&self) -> bool {
+        false
+    }
+
+    /// Whether it estimates the information given z.
+    fn takes_given(&self) -> bool {
+        false
+    }
+}
+
+/// Names of the estimators of which `takes` holds: what an error recommends.
+fn taking(takes: fn(&dyn Estimator) -> bool) -> String {
+    let built = ESTIMATORS.iter().filter_map(|e| Some((e.name, (e.build)(&Spec::new(e.name)).ok()?)));
+    built.filter(|(_, e)| takes(&**e)).map(|(name, _)| name).collect::<Vec<_>>().join(", ")
 }
 
 /// What all estimators hold to.
@@ -114,6 +147,15 @@ pub enum MiError {
         /// Which columns.
         column: String,
     },
+    /// Words, and an estimator that needs numbers.
+    #[error("{columns} holds words, not numbers: name other columns, or take one of {}", taking(|e| e.takes_words()))]
+    Words {
+        /// Which columns.
+        columns: String,
+    },
+    /// z, and an estimator that has no use for it.
+    #[error("it estimates nothing given z: leave out --given, or take one of {}", taking(|e| e.takes_given()))]
+    Given,
     /// Training went astray.
     #[error("training did not give a finite value: look for extreme values in {columns}")]
     Diverged {

@@ -5,8 +5,9 @@ use serde::{Deserialize, Serialize};
 use statrs::function::gamma::digamma;
 
 use super::gaussian::{copy, determined};
+use super::given::{NO_NULL, cells};
 use super::interval::{block_interval, t_quantile};
-use super::knn::Points;
+use super::knn::{Points, within};
 use super::part::Part;
 use super::prepare::{points, tied};
 use super::{Estimate, Kind, MiError, Protocol, Unit, p_value};
@@ -24,6 +25,9 @@ const WIDE: usize = 8;
 
 /// The local terms of an estimator, `[n]` in nats: their mean is the estimate. Takes x, y and k.
 pub(super) type Terms = fn(&Points, &Points, usize) -> Vec<f64>;
+
+/// The local terms given z. Takes x, y, z and k.
+pub(super) type TermsGiven = fn(&Points, &Points, &Points, usize) -> Vec<f64>;
 
 /// Parameters of a nearest-neighbour estimator.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -43,16 +47,24 @@ pub(super) struct Neighbours {
     pub(super) name: &'static str,
     pub(super) k: usize,
     pub(super) terms: Terms,
+    /// The terms given z, if it has such.
+    pub(super) given: Option<TermsGiven>,
     /// Whether it is made for values that occur more than once.
     pub(super) for_ties: bool,
 }
 
 impl Neighbours {
     /// Reads k from the parameters.
-    pub(super) fn new(name: &'static str, spec: &Spec, terms: Terms, for_ties: bool) -> Result<Self, RegistryError> {
+    pub(super) fn new(
+        name: &'static str,
+        spec: &Spec,
+        terms: Terms,
+        given: Option<TermsGiven>,
+        for_ties: bool,
+    ) -> Result<Self, RegistryError> {
         let Params { k } = spec.params()?;
         spec.in_range("k", k as f64, 1.0, 1000.0)?;
-        Ok(Self { name, k, terms, for_ties })
+        Ok(Self { name, k, terms, given, for_ties })
     }
 
     /// The row.
@@ -65,15 +77,21 @@ impl Neighbours {
         let mut warnings = samples.notes.clone();
         let x = points(&samples.x, &samples.rows, &labels.x, &mut warnings)?;
         let y = points(&samples.y, &samples.rows, &labels.y, &mut warnings)?;
-        let width = x.width + y.width;
+        let label = labels.given.as_deref().unwrap_or_default();
+        let z = samples.z.as_deref().map(|z| points(z, &samples.rows, label, &mut warnings)).transpose()?;
+        let width = x.width + y.width + z.as_ref().map_or(0, |z| z.width);
         let all = Part::all(samples);
-        let (own_x, own_y) = (picked(&x, &all.rows), picked(&y, &all.rows));
-        let local = (self.terms)(&own_x, &own_y, self.k);
+        // the rows of `from` give x, those of `rows` y and z
+        let terms = |from: &[u32], rows: &[u32]| match (&z, self.given) {
+            (Some(z), Some(given)) => given(&picked(&x, from), &picked(&y, rows), &picked(z, rows), self.k),
+            _ => (self.terms)(&picked(&x, from), &picked(&y, rows), self.k),
+        };
+        let local = terms(&all.rows, &all.rows);
         let value = mean(&local);
         let name = format!("{}:{}", self.name, self.k);
         let mut out = Estimate::new(&name, labels, value, Unit::Nats, Kind::Estimate, n);
         out.n_effective = block_interval(&local, &samples.episodes()).n_effective;
-        let statistic = |from: &[u32], rows: &[u32]| mean(&(self.terms)(&picked(&x, from), &picked(&y, rows), self.k));
+        let statistic = |from: &[u32], rows: &[u32]| mean(&terms(from, rows));
         let limits = Limits::of(width);
         let part = Part::drawn(samples, limits.interval, &seeds.child("interval"));
         let error = part.subsampled_error(n, 4 * (self.k + 1), seeds, &|rows| statistic(rows, rows));
@@ -83,14 +101,21 @@ impl Neighbours {
         }
         let part = Part::drawn(samples, limits.null, &seeds.child("null"));
         if protocol.permutations > 0 {
-            let null = part.null(samples, protocol, seeds, &|from| statistic(from, &part.rows));
-            out.p_value = p_value(statistic(&part.rows, &part.rows), &null);
+            let under_null = |from: &[u32]| statistic(from, &part.rows);
+            let null = match &z {
+                None => Some(part.null(samples, protocol, seeds, &under_null)),
+                Some(z) => part.null_within(&cells(&picked(z, &part.rows)), protocol, seeds, &under_null),
+            };
+            match null {
+                Some(null) => out.p_value = p_value(under_null(&part.rows), &null),
+                None => warnings.push(NO_NULL.to_owned()),
+            }
         }
         if all.len() < 20 {
             warnings.push(format!("few blocks: the interval rests on {} episodes", all.len()));
         }
         if !self.for_ties {
-            if determined(&own_x, &own_y) {
+            if z.is_none() && determined(&picked(&x, &all.rows), &picked(&y, &all.rows)) {
                 out.value = f64::INFINITY;
                 (out.interval_low, out.interval_high) = (None, None);
                 warnings.push(copy(labels));
@@ -166,6 +191,20 @@ pub(super) fn digammas(n: usize) -> Vec<f64> {
         psi += 1.0 / m as f64;
     }
     out
+}
+
+/// The local terms given z, from the radius and the number of neighbours of each sample.
+pub(super) fn given_terms(
+    [x, y, z]: [&Points; 3],
+    radii: &[f64],
+    psi: &[f64],
+    neighbours: impl Fn(usize) -> usize,
+) -> Vec<f64> {
+    let in_xz = within(&Points::joined(&[x, z]), radii);
+    let in_yz = within(&Points::joined(&[y, z]), radii);
+    let in_z = within(z, radii);
+    let of = |count: u32| psi[count as usize];
+    (0..z.len()).map(|i| psi[neighbours(i)] + of(in_z[i]) - of(in_xz[i]) - of(in_yz[i])).collect()
 }
 
 #[cfg(test)]
@@ -278,6 +317,52 @@ pub(super) mod tests {
         let estimator = (ESTIMATORS.iter().find(|e| e.name == "ksg").unwrap().build)(&spec).unwrap();
         let error = estimator.estimate(&few, &Protocol::default(), &Seeds::new(1)).unwrap_err();
         assert_eq!(error, MiError::TooFewSamples { needed: 11, widths: 2, found: 10 });
+    }
+
+    #[test]
+    fn given_terms_equal_comparing_all_pairs_and_the_common_cause_explains() {
+        for levels in [0.0, 3.0] {
+            let (x, y) = pair(200, [1, 2], levels, 7);
+            let (z, _) = pair(200, [2, 1], levels, 8);
+            let apart = |p: &Points, i: usize, j: usize| {
+                let widest = p.row(i).iter().zip(p.row(j)).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                (widest * 1e9).round() as u64
+            };
+            let found = crate::mi::ksg1::terms_given(&x, &y, &z, 3);
+            for (i, found) in found.into_iter().enumerate() {
+                let others: Vec<[u64; 3]> =
+                    (0..200).filter(|&j| j != i).map(|j| [apart(&x, i, j), apart(&y, i, j), apart(&z, i, j)]).collect();
+                let mut joint: Vec<u64> = others.iter().map(|d| d[0].max(d[1]).max(d[2])).collect();
+                joint.sort_unstable();
+                let radius = joint[2].max(1);
+                let psi = |of: &dyn Fn(&[u64; 3]) -> u64| {
+                    digamma(1.0 + others.iter().filter(|d| of(d) < radius).count() as f64)
+                };
+                let expected = digamma(3.0) + psi(&|d| d[2]) - psi(&|d| d[0].max(d[2])) - psi(&|d| d[1].max(d[2]));
+                assert!((found - expected).abs() < 1e-7, "{levels} {i}: {found} {expected}");
+            }
+        }
+        // x = c + e, y = c + f: dependent, and given c not
+        let noise = linear_samples(0.0, 1500, 2, 3);
+        let column = |of: &dyn Fn(&[f64], &[f64]) -> f64| -> Vec<Vec<f64>> {
+            (0..1500).map(|r| vec![of(noise.x.row(r), noise.y.row(r))]).collect()
+        };
+        let mut samples = samples_of(&column(&|a, b| a[0] + 0.5 * b[0]), &column(&|a, b| a[0] + 0.5 * b[1]));
+        samples.labels.given = Some("c".to_owned());
+        let causes = [column(&|a, _| a[0]), column(&|a, _| a[1])].map(|z| samples_of(&z, &z).x);
+        for name in ["ksg1", "ksg-mixed"] {
+            let [explained, useless] = causes
+                .each_ref()
+                .map(|z| row(name, &Samples { z: Some(std::sync::Arc::clone(z)), ..samples.clone() }, 39));
+            // x and y correlate by 0.8: −½ ln 0.36 = 0.5108
+            assert!(explained.value.abs() < 0.06 && explained.p_value.unwrap() > 0.02, "{name}: {explained:?}");
+            assert!((useless.value - 0.5108).abs() < 0.1 && useless.p_value == Some(0.025), "{name}: {useless:?}");
+            assert_eq!(useless.given.as_deref(), Some("c"));
+        }
+        samples.z = Some(std::sync::Arc::clone(&causes[0]));
+        samples.starts = (0..=150).map(|e| 10 * e).collect::<Vec<_>>().into();
+        let trajectories = row("ksg1", &samples, 39);
+        assert_eq!((trajectories.p_value, trajectories.warnings), (None, vec![NO_NULL.to_owned()]));
     }
 
     #[test]

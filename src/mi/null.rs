@@ -60,7 +60,7 @@ mod tests {
     use crate::schema::{Columns, SampleLabels};
 
     fn samples(exchange: Exchange) -> Samples {
-        let columns = Arc::new(Columns { data: vec![0.0; 12], names: vec!["a".to_owned()] });
+        let columns = Arc::new(Columns::new(vec![0.0; 12], vec!["a".to_owned()]));
         Samples {
             x: Arc::clone(&columns),
             y: columns,

@@ -3,6 +3,7 @@
 
 use rayon::prelude::*;
 
+use super::given::permuted_within;
 use super::{Protocol, permuted_rows};
 use crate::rng::{self, Seeds};
 use crate::schema::{Exchange, Samples};
@@ -86,6 +87,23 @@ impl Part {
             statistic(&permuted_rows(samples, &self.episodes, &self.rows, &mut rng))
         };
         (0..protocol.permutations).into_par_iter().map(draw).collect()
+    }
+
+    /// `statistic` under draws of the null given z, under which x is exchanged within `cells` of rows with alike z (by
+    /// their places in `rows`); `None` when samples stand in episodes.
+    pub(super) fn null_within(
+        &self,
+        cells: &[Vec<u32>],
+        protocol: Protocol,
+        seeds: &Seeds,
+        statistic: &(dyn Fn(&[u32]) -> f64 + Sync),
+    ) -> Option<Vec<f64>> {
+        let draw = |b: usize| {
+            let mut rng = seeds.indexed_stream("null", b as u64);
+            let places = permuted_within(cells, self.rows.len(), &mut rng);
+            statistic(&places.into_iter().map(|i| self.rows[i as usize]).collect::<Vec<_>>())
+        };
+        (self.len() == self.rows.len()).then(|| (0..protocol.permutations).into_par_iter().map(draw).collect())
     }
 
     /// The standard error that `statistic` has on `n` samples, and its degrees of freedom: the episodes are dealt into

@@ -120,7 +120,10 @@ pub(super) fn scales(
     Ok(scales)
 }
 
-/// All rows in `f64`, standardised over `rows`; constant columns are left out.
+/// How far apart different words are, in standard deviations of the other columns: farther than any of those.
+const FAR: f64 = 1e9;
+
+/// All rows in `f64`, standardised over `rows`; constant columns are left out, words are far apart.
 pub(super) fn points(
     columns: &Columns,
     rows: &[u32],
@@ -129,7 +132,8 @@ pub(super) fn points(
 ) -> Result<Points, MiError> {
     let scales = scales(columns, rows, label, warnings)?;
     let all = (0..columns.rows()).map(|r| columns.row(r));
-    let data = all.flat_map(|row| scales.iter().map(|s| s.of(row))).collect();
+    let value = |row: &[f64], s: &Scale| if columns.is_words(s.column) { FAR * row[s.column] } else { s.of(row) };
+    let data = all.flat_map(|row| scales.iter().map(|s| value(row, s)).collect::<Vec<_>>()).collect();
     Ok(Points { data, width: scales.len() })
 }
 

@@ -47,7 +47,7 @@ pub fn run(samples: &[Samples], plan: &Plan, done: &(dyn Fn() + Sync)) -> Vec<Jo
     let work = |&(samples, (name, estimator)): &(&Samples, &Named)| {
         let labels = samples.labels.clone();
         let seeds = seeds.child(&format!("{}/{}/{:?}", labels.x, labels.y, labels.delivered)).child(name);
-        let rows = estimator.estimate(samples, &plan.protocol, &seeds);
+        let rows = fits(samples, &**estimator).and_then(|()| estimator.estimate(samples, &plan.protocol, &seeds));
         done();
         JobResult { job: Job { estimator: name.clone(), labels }, rows }
     };
@@ -56,6 +56,20 @@ pub fn run(samples: &[Samples], plan: &Plan, done: &(dyn Fn() + Sync)) -> Vec<Jo
         compare(same_samples);
     }
     results
+}
+
+/// Whether the estimator can take the samples at all.
+fn fits(samples: &Samples, estimator: &dyn Estimator) -> Result<(), MiError> {
+    if samples.z.is_some() && !estimator.takes_given() {
+        return Err(MiError::Given);
+    }
+    let all = [&samples.x, &samples.y].into_iter().chain(&samples.z);
+    let words: Vec<&str> =
+        all.flat_map(|c| (0..c.width()).filter(|&i| c.is_words(i)).map(|i| c.names[i].as_str())).collect();
+    if words.is_empty() || estimator.takes_words() {
+        return Ok(());
+    }
+    Err(MiError::Words { columns: words.join(", ") })
 }
 
 /// An upper bound below a lower bound of the same samples is none.
@@ -87,7 +101,7 @@ pub(super) mod tests {
     pub(in crate::mi) fn samples_of(x: &[Vec<f64>], y: &[Vec<f64>]) -> Samples {
         let columns = |rows: &[Vec<f64>], name: &str| {
             let names = (0..rows[0].len()).map(|i| format!("{name}{i}")).collect();
-            Arc::new(Columns { data: rows.concat(), names })
+            Arc::new(Columns::new(rows.concat(), names))
         };
         Samples {
             x: columns(x, "x"),

@@ -1,15 +1,17 @@
 //! Samples from stores and tables.
 //!
 //! [`links`] reads a store: one set of samples per ordered link and class, delivered and lost apart. [`table()`] reads
-//! anybody's CSV or Parquet file: one set from named columns.
+//! anybody's CSV, TSV or Parquet file: one set from named columns, or [`all_pairs`] of them. [`lagged`] moves y in time.
 
+mod lag;
 mod store;
 mod table;
 
 use std::path::PathBuf;
 
+pub use lag::lagged;
 pub use store::links;
-pub use table::{TableOptions, is_store, table};
+pub use table::{TableOptions, all_pairs, is_store, table};
 
 use crate::io::IoError;
 use crate::storage::StorageError;
@@ -52,6 +54,34 @@ pub enum PairsError {
     /// A table without a choice of columns.
     #[error("not a rollout store, and as a table it needs --x and --y: name columns of it: {}", .0.display())]
     NoColumns(PathBuf),
+    /// No episode is long enough for a lag.
+    #[error(
+        "no pair {lag} rows apart: the longest episode has {longest} rows; give --time or --group, or a smaller --lag"
+    )]
+    NoLag {
+        /// Rows between x and y.
+        lag: usize,
+        /// Rows of the longest episode.
+        longest: usize,
+    },
+    /// A pattern that is none, or that no column matches.
+    #[error("{pattern:?}: {message}: {}", path.display())]
+    Pattern {
+        /// What stands behind `regex:`.
+        pattern: String,
+        /// What is wrong, and the columns.
+        message: String,
+        /// File.
+        path: PathBuf,
+    },
+    /// Fewer than two columns to compare.
+    #[error("--all-pairs needs two columns of numbers or words, found {found}: {}", path.display())]
+    NoPairs {
+        /// Columns found.
+        found: usize,
+        /// File.
+        path: PathBuf,
+    },
     /// More rows than an estimator can number.
     #[error("more than {} rows: take a part of the data", u32::MAX)]
     TooManyRows,
@@ -114,7 +144,7 @@ pub enum PairsError {
     /// The file is not what its name says.
     #[error("not a readable {form} table: {message}: {}", path.display())]
     Unreadable {
-        /// `CSV` or `Parquet`.
+        /// `CSV`, `TSV` or `Parquet`.
         form: &'static str,
         /// What the reader said.
         message: String,
@@ -126,6 +156,6 @@ pub enum PairsError {
 impl PairsError {
     /// Whether the user's words are at fault, not the data.
     pub fn is_usage(&self) -> bool {
-        matches!(self, Self::UnknownColumn { .. } | Self::NotNumeric { .. } | Self::NoColumns(_))
+        matches!(self, Self::UnknownColumn { .. } | Self::NotNumeric { .. } | Self::NoColumns(_) | Self::Pattern { .. })
     }
 }

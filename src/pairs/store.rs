@@ -15,7 +15,7 @@ struct Track {
 impl Track {
     fn new(name: String, width: usize) -> Self {
         let names = (0..width).map(|i| if width == 1 { name.clone() } else { format!("{name}[{i}]") }).collect();
-        Self { columns: Columns { data: Vec::new(), names }, name }
+        Self { columns: Columns::new(Vec::new(), names), name }
     }
 
     fn extend(&mut self, values: &[f32], episode: u64) -> Result<(), PairsError> {

@@ -1,4 +1,4 @@
-//! Samples from named columns of a CSV or Parquet file.
+//! Samples from named columns of a CSV, TSV or Parquet file.
 
 use std::fs::File;
 use std::io::Read as _;
@@ -12,16 +12,20 @@ use crate::io::IoError;
 use crate::registry::did_you_mean;
 use crate::schema::{Columns, Exchange, SampleLabels, Samples};
 
+/// What a name begins with that is a pattern.
+const PATTERN: &str = "regex:";
 /// Blocks into which one series is cut.
 const BLOCKS: usize = 50;
 
-/// Which columns to read, and what an episode is.
+/// Which columns to read, and what an episode is. `regex:PATTERN` stands for all columns whose name it matches.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct TableOptions {
     /// Columns of x; a vector column counts as many as it is long.
     pub x: Vec<String>,
     /// Columns of y.
     pub y: Vec<String>,
+    /// Columns of z, given which x and y are compared; none: no condition.
+    pub given: Vec<String>,
     /// Rows of equal value are one episode.
     pub group: Option<String>,
     /// Order of the rows within an episode; without `group` all rows are one series.
@@ -58,29 +62,101 @@ pub fn table(path: &Path, options: &TableOptions) -> Result<Samples, PairsError>
         return Err(IoError::Missing(path.to_owned()).into());
     }
     caught(path, |form| {
-        if form == "Parquet" {
-            crate::storage::check_table(path)?;
-        }
-        samples(path, form, options)
+        let options = expanded(path, form, options)?;
+        let frame = read(path, form, &wanted(&options))?;
+        samples(&frame, path, &options)
     })
 }
 
-fn samples(path: &Path, form: &'static str, options: &TableOptions) -> Result<Samples, PairsError> {
+/// One set of samples per unordered pair of the columns `options.x`, or of all columns of numbers or words. The file is
+/// read once; rows with a missing value are left out pair by pair.
+///
+/// # Errors
+/// As [`table()`]; [`PairsError::NoPairs`].
+pub fn all_pairs(path: &Path, options: &TableOptions) -> Result<Vec<Samples>, PairsError> {
+    if !path.exists() {
+        return Err(IoError::Missing(path.to_owned()).into());
+    }
+    caught(path, |form| {
+        let mut options = expanded(path, form, options)?;
+        let chosen = !options.x.is_empty();
+        if !chosen {
+            options.x = names(path, form)?;
+        }
+        let frame = read(path, form, &wanted(&options))?;
+        let others: Vec<&String> = options.given.iter().chain(&options.group).chain(&options.time).collect();
+        let usable = |name: &&String| {
+            let kind = frame.column(name).map(|c| c.dtype().clone());
+            let readable = kind.is_ok_and(|kind| is_numeric(&kind) || kind == DataType::String);
+            chosen || (readable && !others.contains(name))
+        };
+        let columns: Vec<String> = options.x.iter().filter(usable).cloned().collect();
+        if columns.len() < 2 {
+            return Err(PairsError::NoPairs { found: columns.len(), path: path.to_owned() });
+        }
+        let pairs = (0..columns.len()).flat_map(|i| (i + 1..columns.len()).map(move |j| (i, j)));
+        let one = |(i, j): (usize, usize)| {
+            let (x, y) = (vec![columns[i].clone()], vec![columns[j].clone()]);
+            samples(&frame, path, &TableOptions { x, y, ..options.clone() })
+        };
+        pairs.map(one).collect()
+    })
+}
+
+/// All columns that the options name.
+fn wanted(options: &TableOptions) -> Vec<&str> {
     let keys = options.group.iter().chain(&options.time);
-    let wanted: Vec<&str> = options.x.iter().chain(&options.y).chain(keys).map(String::as_str).collect();
-    let frame = read(path, form, &wanted)?;
-    let (x, y) = (numbers(&frame, &options.x, path)?, numbers(&frame, &options.y, path)?);
+    options.x.iter().chain(&options.y).chain(&options.given).chain(keys).map(String::as_str).collect()
+}
+
+/// The options with every `regex:PATTERN` replaced by the columns that it matches, in the order of the file.
+fn expanded(path: &Path, form: &'static str, options: &TableOptions) -> Result<TableOptions, PairsError> {
+    if form == "Parquet" {
+        crate::storage::check_table(path)?;
+    }
+    let mut out = options.clone();
+    for list in [&mut out.x, &mut out.y, &mut out.given] {
+        if !list.iter().any(|name| name.starts_with(PATTERN)) {
+            continue;
+        }
+        let known = names(path, form)?;
+        let mut found = Vec::new();
+        for name in &*list {
+            let Some(pattern) = name.strip_prefix(PATTERN) else {
+                found.push(name.clone());
+                continue;
+            };
+            let wrong =
+                |message: String| PairsError::Pattern { pattern: pattern.to_owned(), message, path: path.to_owned() };
+            let matcher = regex::Regex::new(pattern).map_err(|e| {
+                wrong(format!("not a regular expression: {}", e.to_string().lines().last().unwrap_or_default()))
+            })?;
+            let matched: Vec<&String> = known.iter().filter(|name| matcher.is_match(name)).collect();
+            if matched.is_empty() {
+                let all = known.iter().take(40).map(String::as_str).collect::<Vec<_>>().join(", ");
+                return Err(wrong(format!("matches no column; the columns are {all}")));
+            }
+            found.extend(matched.into_iter().cloned());
+        }
+        *list = found;
+    }
+    Ok(out)
+}
+
+fn samples(frame: &DataFrame, path: &Path, options: &TableOptions) -> Result<Samples, PairsError> {
+    let [x, y, z] = [&options.x, &options.y, &options.given].map(|names| numbers(frame, names, path));
+    let (x, y, z) = (x?, y?, z?);
     let height = frame.height();
-    let group = options.group.as_deref().map(|name| texts(&frame, name, path)).transpose()?;
-    let time = options.time.as_deref().map(|name| Order::of(&frame, name, path)).transpose()?;
+    let group = options.group.as_deref().map(|name| texts(frame, name, path)).transpose()?;
+    let time = options.time.as_deref().map(|name| Order::of(frame, name, path)).transpose()?;
     let whole = |r: usize| {
-        let values = || x.row(r).iter().chain(y.row(r));
+        let values = || x.row(r).iter().chain(y.row(r)).chain(z.row(r));
         values().all(|v| !v.is_nan())
             && group.as_ref().is_none_or(|g| g[r].is_some())
             && time.as_ref().is_none_or(|t| t.has(r))
     };
     let mut rows: Vec<usize> = (0..height).filter(|&r| whole(r)).collect();
-    let columns = wanted.join(", ");
+    let columns = wanted(options).join(", ");
     if rows.is_empty() {
         return Err(PairsError::NoRows { rows: height, columns, path: path.to_owned() });
     }
@@ -97,18 +173,19 @@ fn samples(path: &Path, form: &'static str, options: &TableOptions) -> Result<Sa
     let (starts, label) = episodes(&mut rows, group.as_deref(), options);
     let pick = |columns: &Columns| {
         let data = rows.iter().flat_map(|&r| columns.row(r).iter().copied()).collect();
-        Arc::new(Columns { data, names: columns.names.clone() })
+        Arc::new(Columns { data, names: columns.names.clone(), words: columns.words.clone() })
     };
     Ok(Samples {
         x: pick(&x),
         y: pick(&y),
-        z: None,
+        z: (!options.given.is_empty()).then(|| pick(&z)),
         starts: starts.into(),
         rows: (0..rows.len() as u32).collect(),
         exchange: if group.is_none() && time.is_some() { Exchange::Shift } else { Exchange::Episodes },
         labels: SampleLabels {
             x: options.x.join(","),
             y: options.y.join(","),
+            given: (!options.given.is_empty()).then(|| options.given.join(",")),
             group: label,
             ..SampleLabels::default()
         },
@@ -139,13 +216,19 @@ fn episodes(rows: &mut [usize], group: Option<&[Option<String>]>, options: &Tabl
     (starts, options.group.clone().unwrap_or_default())
 }
 
-/// `Parquet` or `CSV`, by the first bytes, else by the extension.
+/// `Parquet`, `TSV` or `CSV`, by the first bytes, else by the extension.
 fn form(path: &Path) -> Result<&'static str, IoError> {
     let mut magic = [0; 4];
     let file = File::open(path).map_err(IoError::os("open", path))?;
     let read = file.take(4).read(&mut magic).map_err(IoError::os("read", path))?;
-    let named = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("parquet"));
-    Ok(if named || magic[..read] == *b"PAR1" { "Parquet" } else { "CSV" })
+    let named = |extension: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(extension));
+    Ok(if named("parquet") || magic[..read] == *b"PAR1" {
+        "Parquet"
+    } else if named("tsv") || named("tab") {
+        "TSV"
+    } else {
+        "CSV"
+    })
 }
 
 /// Runs what touches a foreign file's data; a panic in there becomes an error of ours.
@@ -165,18 +248,29 @@ fn unreadable(form: &'static str, path: &Path) -> impl Fn(PolarsError) -> PairsE
     }
 }
 
+/// How text of this form is read.
+fn text_options(form: &str) -> CsvReadOptions {
+    let separator = if form == "TSV" { b'\t' } else { b',' };
+    CsvReadOptions::default().map_parse_options(|options| options.with_separator(separator))
+}
+
+/// The names of the file's columns.
+fn names(path: &Path, form: &'static str) -> Result<Vec<String>, PairsError> {
+    let file = File::open(path).map_err(IoError::os("open", path))?;
+    let unreadable = unreadable(form, path);
+    if form == "Parquet" {
+        let schema = ParquetReader::new(file).schema().map_err(&unreadable)?;
+        return Ok(schema.iter_names().map(ToString::to_string).collect());
+    }
+    let options = text_options(form).with_n_rows(Some(0)).with_infer_schema_length(Some(0));
+    let frame = options.into_reader_with_file_handle(file).finish().map_err(&unreadable)?;
+    Ok(frame.get_column_names().into_iter().map(ToString::to_string).collect())
+}
+
 /// The wanted columns of the file.
 fn read(path: &Path, form: &'static str, wanted: &[&str]) -> Result<DataFrame, PairsError> {
     let open = || File::open(path).map_err(IoError::os("open", path));
-    let unreadable = unreadable(form, path);
-    let names: Vec<String> = if form == "Parquet" {
-        let schema = ParquetReader::new(open()?).schema().map_err(&unreadable)?;
-        schema.iter_names().map(ToString::to_string).collect()
-    } else {
-        let options = CsvReadOptions::default().with_n_rows(Some(0)).with_infer_schema_length(Some(0));
-        let frame = options.into_reader_with_file_handle(open()?).finish().map_err(&unreadable)?;
-        frame.get_column_names().into_iter().map(ToString::to_string).collect()
-    };
+    let (names, unreadable) = (names(path, form)?, unreadable(form, path));
     if let Some(&name) = wanted.iter().find(|w| !names.iter().any(|n| n == *w)) {
         let hint = did_you_mean(name, names.iter().map(String::as_str));
         return Err(PairsError::UnknownColumn { name: name.to_owned(), hint, path: path.to_owned() });
@@ -190,7 +284,7 @@ fn read(path: &Path, form: &'static str, wanted: &[&str]) -> Result<DataFrame, P
     } else {
         // the whole file decides a column's type: a float in the last row must not be an error
         let columns = columns.iter().map(|&c| c.into()).collect();
-        let options = CsvReadOptions::default().with_infer_schema_length(None).with_columns(Some(columns));
+        let options = text_options(form).with_infer_schema_length(None).with_columns(Some(columns));
         options.into_reader_with_file_handle(open()?).finish()
     };
     frame.map_err(unreadable)
@@ -216,18 +310,31 @@ fn not_numeric(frame: &DataFrame, column: &Column, path: &Path) -> PairsError {
     PairsError::NotNumeric { name: column.name().to_string(), kind, hint, path: path.to_owned() }
 }
 
-/// Named columns side by side, vectors flattened; a missing value is NaN.
+/// A column of words as the ranks of its words, a missing one NaN; `None` for any other column.
+fn ranks(column: &Column) -> Option<Vec<f64>> {
+    let words = column.str().ok()?;
+    let mut levels: Vec<&str> = words.iter().flatten().collect();
+    levels.sort_unstable();
+    levels.dedup();
+    let rank = |word: Option<&str>| word.map_or(f64::NAN, |word| levels.partition_point(|l| *l < word) as f64);
+    Some(words.iter().map(rank).collect())
+}
+
+/// Named columns side by side, vectors flattened, words ranked; a missing value is NaN.
 fn numbers(frame: &DataFrame, names: &[String], path: &Path) -> Result<Columns, PairsError> {
     let mut parts: Vec<(usize, Vec<f64>)> = Vec::new();
     let mut out = Columns::default();
     for name in names {
         let column = column(frame, name, path)?;
-        let (width, values) = flat(frame, column, path)?;
+        let words = ranks(column);
+        let is_words = words.is_some();
+        let (width, values) = words.map_or_else(|| flat(frame, column, path), |words| Ok((1, words)))?;
         // beyond this a square is no number any more, and a column would look constant
         if let Some(at) = values.iter().position(|v| v.abs() > 1e150) {
             return Err(PairsError::Infinite { name: name.clone(), row: at / width + 1, path: path.to_owned() });
         }
-        if width == 1 && is_numeric(column.dtype()) {
+        out.words.extend(std::iter::repeat_n(is_words, width));
+        if width == 1 && (is_words || is_numeric(column.dtype())) {
             out.names.push(name.clone());
         } else {
             out.names.extend((0..width).map(|i| format!("{name}[{i}]")));

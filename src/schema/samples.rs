@@ -9,9 +9,21 @@ pub struct Columns {
     pub data: Vec<f64>,
     /// One name per column; their number is the width.
     pub names: Vec<String>,
+    /// Per column, whether it holds words: numbers that stand for categories, whose size means nothing. Empty: none does.
+    pub words: Vec<bool>,
 }
 
 impl Columns {
+    /// Columns of numbers.
+    pub fn new(data: Vec<f64>, names: Vec<String>) -> Self {
+        Self { data, names, words: Vec::new() }
+    }
+
+    /// Whether column `c` holds words.
+    pub fn is_words(&self, c: usize) -> bool {
+        self.words.get(c) == Some(&true)
+    }
+
     /// Columns.
     pub fn width(&self) -> usize {
         self.names.len()
@@ -108,7 +120,7 @@ mod tests {
 
     #[test]
     fn samples_know_their_episodes() {
-        let columns = Arc::new(Columns { data: vec![0.0; 6], names: vec!["a".to_owned()] });
+        let columns = Arc::new(Columns::new(vec![0.0; 6], vec!["a".to_owned()]));
         let samples = Samples {
             x: Arc::clone(&columns),
             y: columns,

@@ -35,7 +35,7 @@ fn pairs(n: usize, width: usize, tied: bool) -> (Columns, Columns) {
         x.push(rounded(shared + normal(&mut rng)));
         y.push(rounded(shared + normal(&mut rng)));
     }
-    (Columns { data: x, names: names.clone() }, Columns { data: y, names })
+    (Columns::new(x, names.clone()), Columns::new(y, names))
 }
 
 fn report(tool: &str, x: &Columns, y: &Columns, pool: &rayon::ThreadPool) {

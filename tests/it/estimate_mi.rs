@@ -56,7 +56,18 @@ fn errors_name_the_remedy_and_have_the_right_exit_code() {
         (
             2,
             &[&table, "--x", "s", "--y", "b"],
-            "column \"s\" holds text, expected integers, floats or booleans; of the columns asked for, b are numeric",
+            "s holds words, not numbers: name other columns, or take one of discrete, ksg-mixed",
+        ),
+        (2, &[&table, "--given", "a"], "--x"),
+        (
+            2,
+            &[&table, "--x", "a", "--y", "b", "--given", "g", "--estimator", "jsd"],
+            "it estimates nothing given z: leave out --given, or take one of discrete, gaussian, gcmi, ksg, ksg1, ksg-mixed",
+        ),
+        (
+            1,
+            &[&table, "--x", "a", "--y", "b", "--given", "a", "--estimator", "gaussian"],
+            "what a leaves of a is constant, so it can tell nothing",
         ),
         (2, &[&table], "not a rollout store, and as a table it needs --x and --y"),
         (2, &[&table, "--x", "a"], "--y"),
@@ -116,6 +127,67 @@ fn groups_series_and_rows_are_named_in_the_output() {
 }
 
 #[test]
+fn lags_patterns_and_all_pairs_of_any_separator() {
+    let dir = tempfile::tempdir().unwrap();
+    // y follows x three rows later
+    let mut rng = ccmarl::rng::Seeds::new(1).stream("lag");
+    let series: Vec<f64> = (0..400).map(|_| ccmarl::rng::normal(&mut rng)).collect();
+    let mut text = "t\tobs_a\tobs_b\ty\tg\tw\n".to_owned();
+    for t in 0..400 {
+        let later = if t >= 3 { series[t - 3] } else { 0.0 } + 0.3 * ccmarl::rng::normal(&mut rng);
+        let g = t / 20;
+        writeln!(text, "{t}\t{}\t{}\t{later}\t{g}\t{}", series[t], ccmarl::rng::normal(&mut rng), ["u", "v"][t % 2])
+            .unwrap();
+    }
+    let table = write(dir.path(), "series.tsv", &text);
+    for key in [["--time", "t"], ["--group", "g"]] {
+        let args = [table.as_str(), "--x", "obs_a", "--y", "y", "--lag", "0..4", "--estimator", "gaussian"];
+        let rows = json(&[&args[..], &key].concat());
+        let values: Vec<f64> = rows.iter().map(|r| r["value"].as_f64().unwrap()).collect();
+        assert_eq!(
+            rows.iter().map(|r| r["y"].as_str().unwrap()).collect::<Vec<_>>(),
+            ["y", "y[+1]", "y[+2]", "y[+3]", "y[+4]"]
+        );
+        // −½ ln(1 − 1/1.09)
+        assert!(
+            (values[3] - 1.245).abs() < 0.1 && values.iter().enumerate().all(|(i, v)| i == 3 || *v < 0.05),
+            "{values:?}"
+        );
+        let left = if key[0] == "--time" { 397 } else { 20 * 17 };
+        assert_eq!(rows[3]["n"], left);
+    }
+    let (_, out, _) =
+        run(&[&table, "--x", "obs_a", "--y", "y", "--time", "t", "--lag", "0,3", "--estimator", "gaussian"]);
+    assert!(out.contains("obs_a ; y[+3]"), "{out}");
+    let rows = json(&[&table, "--x", "regex:^obs_", "--y", "y", "--estimator", "gaussian"]);
+    assert_eq!(rows[0]["x"], "obs_a,obs_b");
+    let plot = dir.path().join("pairs.svg").to_string_lossy().into_owned();
+    let all = [table.as_str(), "--all-pairs", "--group", "g", "--estimator", "gcmi,discrete", "--permutations", "0"];
+    let rows = json(&[&all[..], &["--plot", &plot]].concat());
+    let of = |name: &str| rows.iter().filter(|r| r["estimator"] == name).count();
+    // t, obs_a, obs_b, y, w: ten pairs, six of them without words
+    assert_eq!((of("gcmi"), of("discrete"), of("discrete-mm")), (6, 10, 10));
+    let svg = std::fs::read_to_string(&plot).unwrap();
+    assert!(svg.contains("obs_b") && svg.contains("column") && !svg.contains("receiver"));
+    let (code, _, err) = run(&[&all[..], &["--plot", &plot]].concat());
+    assert!(code == 2 && err.contains("output exists: give --force"), "{err}");
+    for (code, args, message) in [
+        (2, &["--x", "regex:^zzz", "--y", "y"][..], "\"^zzz\": matches no column; the columns are t, obs_a"),
+        (2, &["--x", "regex:(", "--y", "y"], "\"(\": not a regular expression"),
+        (2, &["--x", "obs_a"], "--x needs --y, or --all-pairs"),
+        (2, &["--x", "obs_a", "--y", "y", "--lag", "5..2"], "expected 3, 0,1,5 or 0..10"),
+        (1, &["--x", "obs_a", "--y", "y", "--lag", "1"], "no pair 1 rows apart: the longest episode has 1 rows"),
+        (1, &["--all-pairs", "--x", "y"], "--all-pairs needs two columns of numbers or words, found 1"),
+        (2, &["--x", "obs_a", "--y", "y", "--plot", "x.svg"], "--plot draws a matrix: give --all-pairs, or a store"),
+        (2, &["--all-pairs", "--plot", "x.pdf"], "expected a name that ends in .svg or .png"),
+    ] {
+        let (found, out, err) = run(&[&[table.as_str()], args].concat());
+        assert_eq!((found, out.as_str()), (code, ""), "{args:?}: {err}");
+        assert!(err.contains(message), "{args:?}: {err}");
+    }
+}
+
+#[test]
 fn missing_values_are_counted_copies_are_infinite_and_strict_fails_on_warnings() {
     let dir = tempfile::tempdir().unwrap();
     let mut text = "a,b,d\n,1,1\n2,NaN,3\n".to_owned();
@@ -151,7 +223,13 @@ fn parquet_with_vectors_and_nulls_reads_as_its_columns_and_the_three_outputs_agr
     let args = [file.as_str(), "--x", "a", "--y", "v,b", "--estimator", "gaussian"];
     let rows = json(&args);
     assert_eq!((&rows[0]["n"], &rows[0]["y"]), (&49.into(), &"v,b".into()));
-    for name in ["r.json", "r.csv", "r.parquet"] {
+    for (form, name) in [("json", "r.json"), ("csv", "r.csv"), ("parquet", "r.parquet")] {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_ccmarl"));
+        let output =
+            command.arg("estimate-mi").args(args).args(["--format", form, "--out", &out(name)]).output().unwrap();
+        assert_eq!(output.stdout, std::fs::read(out(name)).unwrap(), "{form}");
+    }
+    for name in ["s.json", "s.csv", "s.parquet"] {
         let (code, _, err) = run(&[&args[..], &["--out", &out(name)]].concat());
         assert_eq!(code, 0, "{err}");
     }
@@ -244,7 +322,7 @@ fn the_fixed_tables_give_their_golden_rows() {
 fn categories_have_their_exact_information() {
     // datasets/tables/README.md, recomputed there by its make.py
     let dir = tempfile::tempdir().unwrap();
-    let tables = [coded("playtennis", dir.path()), coded("titanic", dir.path())];
+    let tables = [dataset("tables/playtennis.csv"), coded("titanic", dir.path())];
     let cases = [
         (0, "outlook", "play", 0.246750),
         (0, "humidity", "play", 0.151836),
@@ -255,6 +333,13 @@ fn categories_have_their_exact_information() {
         (1, "age", "survived", 0.006411),
         (1, "class,age,sex", "survived", 0.220226),
     ];
+    let given =
+        [&tables[1], "--x", "class", "--y", "survived", "--given", "sex", "--estimator", "discrete", "--unit", "bits"];
+    let rows = json(&given);
+    assert!((rows[0]["value"].as_f64().unwrap() - 0.056126).abs() < 5e-7, "{}", rows[0]);
+    assert_eq!((&rows[0]["given"], &rows[0]["unit"]), (&"sex".into(), &"bits".into()));
+    let (_, out, _) = run(&given);
+    assert!(out.contains("class ; survived | sex") && out.contains("bits"), "{out}");
     for (table, x, y, bits) in cases {
         let rows = json(&[&tables[table], "--x", x, "--y", y, "--estimator", "discrete", "--permutations", "0"]);
         let value = rows[0]["value"].as_f64().unwrap();
@@ -282,6 +367,11 @@ fn nearest_neighbours_and_ranks_read_the_flowers() {
         assert!((found - expected).abs() < 1e-7, "{x}: {found} against {expected}");
     }
     assert!((value("petal_length", "petal_width", "gcmi") - 1.0).abs() < 0.3);
+    // words are as far apart as codes that are far apart
+    let words =
+        json(&[&dataset("tables/iris.csv"), "--x", "petal_width", "--y", "species", "--estimator", "ksg-mixed"]);
+    let found = words[0]["value"].as_f64().unwrap();
+    assert!((found - 1.04).abs() < 0.1 && words[0]["warnings"][0].is_null(), "{}", words[0]);
     let (code, out, err) = run(&[&table, "--x", "petal_length", "--y", "petal_width", "--estimator", "ksg,ksg2:5"]);
     assert_eq!(code, 0, "{err}");
     assert!(

@@ -64,6 +64,7 @@ fn data() -> Data {
             Reference { label: "oracle policy −70.3".to_owned(), value: -70.3 },
         ],
         cells,
+        axes: <[String; 2]>::default(),
     }
 }
 

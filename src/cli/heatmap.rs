@@ -1,0 +1,87 @@
+//! A heat map of estimates: links of a store, or pairs of a table's columns.
+
+use std::path::{Path, PathBuf};
+
+use crate::Error;
+use crate::figure::{self, Cell, Data, FIGURES};
+use crate::io;
+use crate::mi::Estimate;
+use crate::registry::find;
+
+/// Where the figure goes.
+pub(super) struct Target {
+    path: PathBuf,
+    is_png: bool,
+}
+
+/// Checks the name before anything is computed.
+pub(super) fn target(path: &Path, force: bool) -> Result<Target, Error> {
+    io::refuse_existing(path, force)?;
+    let ends = |with: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(with));
+    if !ends("svg") && !ends("png") {
+        let message = format!("--plot: expected a name that ends in .svg or .png, found {}", path.display());
+        return Err(Error::Usage(message));
+    }
+    Ok(Target { path: path.to_owned(), is_png: ends("png") })
+}
+
+/// Draws the rows of the first estimator that has a finite value.
+pub(super) fn draw(rows: &[Estimate], target: Target) -> anyhow::Result<()> {
+    let Some(first) = rows.iter().find(|r| r.value.is_finite()) else {
+        anyhow::bail!("no finite value to draw: {}", target.path.display());
+    };
+    let of_links = first.sender.is_some();
+    let chosen = rows.iter().filter(|r| r.estimator == first.estimator);
+    let cell = |row: &Estimate| {
+        let panel = match row.delivered {
+            Some(true) => "delivered",
+            Some(false) => "lost",
+            None => "",
+        };
+        let ends = if of_links {
+            (row.sender.clone(), row.receiver.clone())
+        } else {
+            (Some(row.x.clone()), Some(row.y.clone()))
+        };
+        let (sender, receiver) = (ends.0.unwrap_or_default(), ends.1.unwrap_or_default());
+        Cell { panel: panel.to_owned(), sender, receiver, value: row.value }
+    };
+    let mut cells: Vec<Cell> = chosen.map(cell).collect();
+    if !of_links {
+        // information has no direction; the diagonal stays empty
+        let mirrored = |c: &Cell| Cell { sender: c.receiver.clone(), receiver: c.sender.clone(), ..c.clone() };
+        let mut names: Vec<String> =
+            cells.iter().map(|c| c.sender.clone()).chain(cells.iter().map(|c| c.receiver.clone())).collect();
+        let mut seen = std::collections::BTreeSet::new();
+        names.retain(|name| seen.insert(name.clone()));
+        let diagonal =
+            names.into_iter().map(|n| Cell { panel: String::new(), sender: n.clone(), receiver: n, value: f64::NAN });
+        // the diagonal first: it sets the order of rows and columns
+        cells = diagonal.chain(cells.iter().map(mirrored)).chain(cells.iter().cloned()).collect();
+    }
+    let data = Data {
+        title: "Mutual information".to_owned(),
+        subtitle: format!("{}: {}, {}", first.estimator, first.kind.name(), first.unit.name()),
+        unit: format!("mutual information, {}", first.unit.name()),
+        cells,
+        axes: if of_links { <[String; 2]>::default() } else { ["column".to_owned(), "column".to_owned()] },
+        ..Data::default()
+    };
+    let entry = find("figure", FIGURES, "mi-heatmap")?;
+    if target.is_png {
+        let folder =
+            tempfile::tempdir_in(target.path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")))?;
+        let whole = folder.path().join("figure.png");
+        figure::png(entry, &data, &whole)?;
+        std::fs::rename(whole, &target.path)?;
+    } else {
+        io::write_atomic(&target.path, figure::svg(entry, &data)?.as_bytes()).map_err(Error::from)?;
+    }
+    super::ui::say(&format!(
+        "drew {} values of {}: {}",
+        rows.iter().filter(|r| r.estimator == first.estimator).count(),
+        first.estimator,
+        target.path.display()
+    ));
+    Ok(())
+}
