@@ -398,7 +398,7 @@ mod tests {
             ([&[0, 1, 1, 0, 1][..], &[1; 5][..]], width),
             ([&[0, 0, 1], &[1; 3]], width),
             ([&[0, 1, 0], &[1; 3]], "2 rows were expected, 1 are there"),
-            ([&[0, 1, 0, 1], &[1, 0, 1, 1]], "a null where none may be"),
+            ([&[0, 1, 0, 1], &[1, 0, 1, 1]], "4 values in 12 bytes"),
         ] {
             assert_eq!(fault(bad, nulls, None), format!("{message}{expected}"), "{bad:?}");
         }
