@@ -185,7 +185,9 @@ mod tests {
             let critic = Separable::paper(7, 3);
             let mut params = Vec::new();
             critic.init(&mut rng, &mut params);
-            params.iter_mut().for_each(|p| *p *= 3.0);
+            for p in &mut params {
+                *p *= 3.0;
+            }
             let mut draw = |n: usize| (0..n).map(|_| rng::normal(&mut rng) as f32).collect::<Vec<_>>();
             let (x, y) = (draw(n * 7), draw(n * 3));
             let negatives = all_others(n);

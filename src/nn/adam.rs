@@ -60,16 +60,16 @@ impl Adam {
         let power = self.t as f64;
         let correct1 = 1.0 - libm::pow(f64::from(beta1), power);
         let root2 = libm::sqrt(1.0 - libm::pow(f64::from(beta2), power)) as f32;
-        let step = (f64::from(learning_rate) / correct1) as f32;
+        let size = (f64::from(learning_rate) / correct1) as f32;
         let Self { config, m, v, .. } = self;
-        Level::best().run(Step { config: *config, step, root2, tau, params, grads, m, v, target });
+        Level::best().run(Step { config: *config, size, root2, tau, params, grads, m, v, target });
     }
 }
 
 /// One step over all parameters.
 struct Step<'a> {
     config: AdamConfig,
-    step: f32,
+    size: f32,
     root2: f32,
     tau: f32,
     params: &'a mut [f32],
@@ -99,7 +99,7 @@ impl Step<'_> {
         s.store(m, first);
         s.store(v, second);
         let root = s.add(s.div(s.sqrt(second), s.splat(self.root2)), s.splat(epsilon));
-        let new = s.sub(s.load(p), s.div(s.mul(s.splat(self.step), first), root));
+        let new = s.sub(s.load(p), s.div(s.mul(s.splat(self.size), first), root));
         s.store(p, new);
         if !t.is_empty() {
             let old = s.load(t);
@@ -194,7 +194,7 @@ mod tests {
             let (params_of, target_of) = (&mut params, &mut target);
             level.run(Step {
                 config: *config,
-                step: 0.1,
+                size: 0.1,
                 root2: 0.5,
                 tau: 0.25,
                 params: params_of,

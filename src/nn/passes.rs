@@ -324,7 +324,9 @@ impl Activation {
             Self::Sigmoid => sigmoid_in_place(values),
             Self::Relu | Self::LeakyRelu => {
                 let leak = self.leak().unwrap_or(0.0);
-                values.iter_mut().for_each(|y| *y = if *y > 0.0 { *y } else { leak * *y });
+                for y in values.iter_mut() {
+                    *y = if *y > 0.0 { *y } else { leak * *y };
+                }
             }
         }
     }

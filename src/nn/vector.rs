@@ -22,7 +22,7 @@ pub(crate) fn exp<S: Simd>(s: S, x: S::V) -> S::V {
     // constants first: no number stays no number
     let x = s.max(s.splat(-87.0), s.min(s.splat(87.0), x));
     let n = s.round(s.mul(x, s.splat(core::f32::consts::LOG2_E)));
-    let r = s.fma(n, s.splat(-0.693_359_375), x);
+    let r = s.fma(n, s.splat(-0.693_359_4), x);
     let r = s.fma(n, s.splat(2.121_944_4e-4), r);
     let p = polynomial(s, r, [1.987_569_1e-4, 1.398_199_9e-3, 8.333_452e-3, 4.166_579_6e-2, 1.666_666_5e-1, 0.5]);
     let y = s.add(s.fma(p, s.mul(r, r), r), s.splat(1.0));
@@ -50,12 +50,12 @@ pub(crate) fn ln<S: Simd>(s: S, x: S::V) -> S::V {
             -1.666_805_8e-1,
             2.000_071_5e-1,
             -2.499_999_4e-1,
-            3.333_333_1e-1,
+            3.333_333e-1,
         ],
     );
     let y = s.fma(s.mul(p, f), z, s.mul(e, s.splat(-2.121_944_4e-4)));
     let y = s.fma(s.splat(-0.5), z, y);
-    s.fma(e, s.splat(0.693_359_375), s.add(f, y))
+    s.fma(e, s.splat(0.693_359_4), s.add(f, y))
 }
 
 /// tanh x by a rational function (the one of Eigen), held to [−1, 1].
@@ -68,7 +68,7 @@ pub(crate) fn tanh<S: Simd>(s: S, x: S::V) -> S::V {
         z,
         [
             -2.760_768_5e-16,
-            2.000_187_9e-13,
+            2.000_188e-13,
             -8.604_672e-11,
             5.122_297_1e-8,
             1.485_722_4e-5,
@@ -76,7 +76,7 @@ pub(crate) fn tanh<S: Simd>(s: S, x: S::V) -> S::V {
             4.893_524_6e-3,
         ],
     );
-    let q = polynomial(s, z, [1.198_258_4e-6, 1.185_347_1e-4, 2.268_434_6e-3, 4.893_525_2e-3]);
+    let q = polynomial(s, z, [1.198_258_4e-6, 1.185_347_1e-4, 2.268_434_6e-3, 4.893_525e-3]);
     let y = s.div(s.mul(x, p), q);
     s.max(s.splat(-1.0), s.min(s.splat(1.0), y))
 }

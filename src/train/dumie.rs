@@ -133,11 +133,11 @@ impl Dumie {
         &mut self,
         replay: &Replay,
         rng: &mut Stream,
-        mut heldout: Option<&mut Stream>,
+        heldout: Option<&mut Stream>,
     ) -> Result<DumieMetrics, TrainError> {
         let mut means = [[0.0; 2]; 4];
         let mut count = |at: usize, value: f64| means[at] = [means[at][0] + value, means[at][1] + 1.0];
-        if let Some(rng) = heldout.as_deref_mut() {
+        if let Some(rng) = heldout {
             for (at, class, estimators) in [(1, Class::Delivered, &self.jsd), (3, Class::Lost, &self.club)] {
                 for estimator in estimators {
                     self.nets.heldout(class, estimator, rng).into_iter().for_each(|value| count(at, value));

@@ -6,27 +6,26 @@ use ccmarl::nn::Activation;
 use ccmarl::record::{Recording, build_policy};
 use ccmarl::registry::Spec;
 use ccmarl::rng::{self, Seeds};
-use ccmarl::schema::{AgentSpec, Controller, Layout};
+use ccmarl::schema::{AgentSpec, Controller};
 use ccmarl::train::config::{DumieConfig, Estimators, Negatives, PairSource};
 use ccmarl::train::dumie::Dumie;
 use ccmarl::train::replay::Replay;
 
 use super::allocations::allocations;
 
-/// A replay of random play over lossy links, and the layout of its episodes.
-fn replay(dumie: &mut [&mut Dumie]) -> (Replay, Layout) {
+/// A replay of random play over lossy links, which `dumie` has observed too.
+fn replay(dumie: &mut Dumie) -> Replay {
     let scenario = ccmarl::scenario::build(&Spec::new("simple_spread")).unwrap();
     let link = link::build(&Spec::new("dropout").with("p", 0.2), &Setting { distance_unit: 1.0 }).unwrap();
     let policy = build_policy(&Spec::new("random"), &*scenario).unwrap();
     let recording = Recording { scenario: &*scenario, link: &*link, policy: &*policy, seed: 1, episodes: 60 };
-    let layout = scenario.layout();
-    let mut replay = Replay::new(&layout, scenario.steps(), 10_000).unwrap();
+    let mut replay = Replay::new(&scenario.layout(), scenario.steps(), 10_000).unwrap();
     for index in 0..60 {
         let episode = recording.episode(index);
         replay.push(&episode, &[]).unwrap();
-        dumie.iter_mut().for_each(|dumie| dumie.observe(&episode));
+        dumie.observe(&episode);
     }
-    (replay, layout)
+    replay
 }
 
 #[test]
@@ -54,7 +53,7 @@ fn an_update_allocates_nothing_of_its_own_once_it_is_warm() {
         let rows = if estimators.negatives == Negatives::All { 100 } else { 1024 };
         let seeds = Seeds::new(1);
         let mut dumie = Dumie::new(&layout, estimators, [0.01, 0.01], &seeds).unwrap();
-        let (replay, _) = replay(&mut [&mut dumie]);
+        let replay = replay(&mut dumie);
         let mut learner = Maddpg::new(&learners, Activation::Tanh, config, &seeds).unwrap();
         let (mut batch, mut bonus) = (Batch::default(), Vec::new());
         let mut update = |index: u64| {

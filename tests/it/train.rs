@@ -95,7 +95,9 @@ fn an_interrupted_run_that_is_resumed_ends_with_the_bytes_of_an_uninterrupted_on
 fn every_option_of_learner_and_estimators_trains_differently_and_resumes_to_the_same_bytes() {
     use ccmarl::algo::{ActorStep, Masks, Messages};
     use ccmarl::train::config::{Estimators, LostMessage, Negatives, PairSource, Shaping};
-    let options: [(&str, fn(&mut TrainConfig)); 11] = [
+
+    type Set = fn(&mut TrainConfig);
+    let options: [(&str, Set); 11] = [
         ("defaults", |_| ()),
         ("messages off", |c| c.maddpg.messages = Messages::Off),
         ("actor step per agent", |c| c.maddpg.actor_step = ActorStep::PerAgent),
