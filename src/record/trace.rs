@@ -241,13 +241,10 @@ mod tests {
 
     /// Reads the text as a file `t.csv`.
     fn read(text: &str) -> Result<Trace, String> {
-        let read = || -> std::io::Result<_> {
-            let dir = tempfile::tempdir()?;
-            let path = dir.path().join("t.csv");
-            File::create(&path).and_then(|mut file| std::io::Write::write_all(&mut file, text.as_bytes()))?;
-            Ok(read_trace(&path).map_err(|e| e.to_string().replace(path.to_string_lossy().as_ref(), "t.csv")))
-        };
-        read().map_err(|e| e.to_string())?
+        let dir = tempfile::tempdir().map_err(|e| e.to_string())?;
+        let path = dir.path().join("t.csv");
+        crate::io::write_atomic(&path, text.as_bytes()).map_err(|e| e.to_string())?;
+        read_trace(&path).map_err(|e| e.to_string().replace(path.to_string_lossy().as_ref(), "t.csv"))
     }
 
     const HEAD: &str = "episode,step,sender,receiver,delivered\n";

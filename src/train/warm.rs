@@ -30,6 +30,9 @@ impl Trainer {
                 name(other)
             )));
         }
+        if self.dumie.is_none() {
+            return self.replay.fill(source); // rings need episodes, replay does not
+        }
         let mut episodes = 0;
         while let Some(episode) = source.next_episode()? {
             self.observe(&episode)?;

@@ -7,6 +7,7 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use ccmarl::channel::{Fit, FitOutcome, LinkStatistics, MAX_LOSSES, Observations, Runs, fit};
+use ccmarl::io::write_atomic;
 use ccmarl::link::LINKS;
 use ccmarl::record::{Recording, build_link, build_policy};
 use ccmarl::registry::Spec;
@@ -182,7 +183,7 @@ fn a_classifier_does_what_its_data_did() {
     assert!(balanced >= 0.99 && held.calibration_error.value <= 0.02, "{held:?}");
     // as a prior, on worlds that it has not seen, through its file
     let file = dir.path().join("link.json");
-    std::fs::write(&file, fit.to_json().unwrap()).unwrap();
+    write_atomic(&file, fit.to_json().unwrap().as_bytes()).unwrap();
     let link = Spec::new("file").with("path", file.to_str().unwrap());
     let truth = Spec::new("distance").with("threshold", 3);
     let apart = curves_apart(&simulated(&link, 200, 9), &simulated(&truth, 200, 9), 50);
@@ -252,7 +253,7 @@ fn fits_are_the_same_twice_and_tables_of_bits_do_as_well() {
         }
     }
     let table = dir.path().join("bits.csv");
-    std::fs::write(&table, rows).unwrap();
+    write_atomic(&table, rows.as_bytes()).unwrap();
     let (_, other) = fitted(&table, "auto", 1);
     assert_eq!((other.link, other.parameters), (first.link, first.parameters));
     let refused = other.compared.iter().filter(
@@ -280,7 +281,7 @@ fn a_link_that_loses_its_first_message_and_links_that_differ_are_noticed() {
             .unwrap();
     }
     let table = dir.path().join("differ.csv");
-    std::fs::write(&table, rows).unwrap();
+    write_atomic(&table, rows.as_bytes()).unwrap();
     let (_, fit) = fitted(&table, "dropout", 1);
     assert!(fit.notes.iter().any(|note| note.starts_with("the links differ (chi-square p = ")), "{:?}", fit.notes);
 }
@@ -309,7 +310,7 @@ fn report_of_recovery() {
     }
     let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("reports/channels");
     std::fs::create_dir_all(&dir).unwrap();
-    std::fs::write(dir.join("recovery.csv"), out).unwrap();
+    write_atomic(&dir.join("recovery.csv"), out.as_bytes()).unwrap();
 }
 
 /// The table of bursts of reports/channels.
@@ -328,7 +329,7 @@ fn report_of_bursts() {
             println!("{}", out.lines().last().unwrap());
         }
     }
-    std::fs::write(dir.join("bursts.csv"), out).unwrap();
+    write_atomic(&dir.join("bursts.csv"), out.as_bytes()).unwrap();
 }
 
 /// The table of classifiers and the figures of reports/channels.
@@ -352,7 +353,7 @@ fn report_of_classifiers() {
             draw(&dir.join("learned-reliability.svg"), "reliability", &fit.reliability());
         }
     }
-    std::fs::write(dir.join("learned.csv"), out).unwrap();
+    write_atomic(&dir.join("learned.csv"), out.as_bytes()).unwrap();
 
     let heavy = simulated(&Spec::new("markov").with("level", "heavy"), 1000, 1);
     let title = "markov:heavy on simple_spread, 1000 episodes";
@@ -365,5 +366,5 @@ fn report_of_classifiers() {
 
 fn draw(path: &Path, name: &str, data: &ccmarl::figure::Data) {
     let entry = ccmarl::registry::find("figure", ccmarl::figure::FIGURES, name).unwrap();
-    std::fs::write(path, ccmarl::figure::svg(entry, data).unwrap()).unwrap();
+    write_atomic(path, ccmarl::figure::svg(entry, data).unwrap().as_bytes()).unwrap();
 }

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use assert_cmd::Command;
+use ccmarl::io::write_atomic;
 use ccmarl::storage;
 use serde_json::Value;
 
@@ -61,9 +62,9 @@ fn fit_link_refuses_what_it_cannot_use_and_replaces_only_its_own() {
     let dir = dir.path();
     record(dir, "dropout:0.3", 20, "store");
     record(dir, "perfect", 20, "lossless");
-    std::fs::write(dir.join("thesis.json"), "{}").unwrap();
-    std::fs::write(dir.join("bad.csv"), "episode,step,sender,receiver,delivered\n0,0,a,b,2\n").unwrap();
-    std::fs::write(dir.join("bad.json"), r#"{"kind":"ccmarl link","link":{"name":"dropout","p":7}}"#).unwrap();
+    write_atomic(&dir.join("thesis.json"), b"{}").unwrap();
+    write_atomic(&dir.join("bad.csv"), b"episode,step,sender,receiver,delivered\n0,0,a,b,2\n").unwrap();
+    write_atomic(&dir.join("bad.json"), br#"{"kind":"ccmarl link","link":{"name":"dropout","p":7}}"#).unwrap();
     done(dir, "fit-link store --out link.json");
     for (words, code, fault) in [
         ("fit-link store --out link.json", 2, "output exists: give --force"),

@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
+use ccmarl::io::write_atomic;
 use ccmarl::link::{Body, FEATURES, LINKS, Link, Setting, build};
 use ccmarl::record::{Options, Recording, build_link, build_policy, read_trace, returns};
 use ccmarl::registry::Spec;
@@ -30,9 +31,9 @@ fn files() -> tempfile::TempDir {
             writeln!(rows, "{episode},{step},{s},{r},{bit}").unwrap();
         }
     }
-    std::fs::write(dir.path().join("trace.csv"), rows).unwrap();
+    write_atomic(&dir.path().join("trace.csv"), rows.as_bytes()).unwrap();
     let link = json!({"kind": "ccmarl link", "link": {"name": "dropout", "p": 0.4}});
-    std::fs::write(dir.path().join("link.json"), link.to_string()).unwrap();
+    write_atomic(&dir.path().join("link.json"), link.to_string().as_bytes()).unwrap();
     dir
 }
 
