@@ -9,7 +9,6 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
-use ccmarl::link::{self, Setting};
 use ccmarl::record::{self, Options, POLICIES, Recording};
 use ccmarl::registry::Spec;
 use ccmarl::schema::Layout;
@@ -28,7 +27,7 @@ fn main() {
     let repeats: u64 = option("--repeats", "5").parse().unwrap();
     let (only, form) = (option("--only", ""), option("--form", ""));
     let scenario = scenario::build(&Spec::new("simple_spread").with("agents", 3)).unwrap();
-    let link = link::build(&Spec::new("perfect"), &Setting { distance_unit: scenario.link_unit() }).unwrap();
+    let link = record::build_link(&Spec::new("perfect"), &*scenario).unwrap();
     let policy = Spec::parse("policy", POLICIES, &option("--policy", "random")).unwrap();
     let policy = record::build_policy(&policy, &*scenario).unwrap();
     let recording = Recording { scenario: &*scenario, link: &*link, policy: &*policy, seed: 1, episodes };

@@ -12,7 +12,6 @@ use std::time::Instant;
 
 use ccmarl::algo::{ActorStep, Batch, Maddpg, MaddpgConfig, Messages};
 use ccmarl::io::write_atomic;
-use ccmarl::link::{self, Setting};
 use ccmarl::nn::{Activation, Level, Mlp, Tape};
 use ccmarl::record::{self, Recording};
 use ccmarl::registry::Spec;
@@ -51,7 +50,7 @@ impl Bench {
     fn new(config: MaddpgConfig, dumie: Option<DumieConfig>) -> Self {
         let spec = Spec::new("simple_spread").with("decoder", "mpe5");
         let scenario = ccmarl::scenario::build(&spec).unwrap();
-        let link = link::build(&Spec::new("dropout").with("p", 0.2), &Setting { distance_unit: 1.0 }).unwrap();
+        let link = record::build_link(&Spec::new("dropout").with("p", 0.2), &*scenario).unwrap();
         let policy = record::build_policy(&Spec::new("random"), &*scenario).unwrap();
         let recording = Recording { scenario: &*scenario, link: &*link, policy: &*policy, seed: 1, episodes: 400 };
         let episodes: Vec<Episode> = (0..400).map(|index| recording.episode(index)).collect();

@@ -1,9 +1,8 @@
 //! The learner: what its updates allocate, and a problem whose value is known in closed form.
 
 use ccmarl::algo::{ActorStep, Batch, Maddpg, MaddpgConfig, Messages};
-use ccmarl::link::{self, Setting};
 use ccmarl::nn::Activation;
-use ccmarl::record::{Recording, build_policy};
+use ccmarl::record::{Recording, build_link, build_policy};
 use ccmarl::registry::Spec;
 use ccmarl::rng::{self, Seeds};
 use ccmarl::schema::{AgentSpec, Controller};
@@ -16,7 +15,7 @@ use super::allocations::allocations;
 /// A replay of random play over lossy links, which `dumie` has observed too.
 fn replay(dumie: &mut Dumie) -> Replay {
     let scenario = ccmarl::scenario::build(&Spec::new("simple_spread")).unwrap();
-    let link = link::build(&Spec::new("dropout").with("p", 0.2), &Setting { distance_unit: 1.0 }).unwrap();
+    let link = build_link(&Spec::new("dropout").with("p", 0.2), &*scenario).unwrap();
     let policy = build_policy(&Spec::new("random"), &*scenario).unwrap();
     let recording = Recording { scenario: &*scenario, link: &*link, policy: &*policy, seed: 1, episodes: 60 };
     let mut replay = Replay::new(&scenario.layout(), scenario.steps(), 10_000).unwrap();

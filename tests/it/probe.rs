@@ -112,10 +112,9 @@ fn trained(algorithm: &str) -> f64 {
 
 /// The share of b = 1 among these 400 episodes, which all policies of a seed meet; the oracle plays them here.
 fn share() -> f64 {
-    use ccmarl::link;
-    use ccmarl::record::{Recording, build_policy};
+    use ccmarl::record::{Recording, build_link, build_policy};
     let probe = Probe::new();
-    let link = link::build(&Spec::new("perfect"), &link::Setting { distance_unit: 1.0 }).unwrap();
+    let link = build_link(&Spec::new("perfect"), &probe).unwrap();
     let policy = build_policy(&Spec::new("scripted"), &probe).unwrap();
     let recording = Recording { scenario: &probe, link: &*link, policy: &*policy, seed: 1, episodes: 400 };
     let episodes = recording.together(&recording.layout(), 0, 400);
