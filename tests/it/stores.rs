@@ -426,7 +426,7 @@ fn a_manifest_that_lies_is_an_error() {
         let error = message(read(&path));
         assert!(error.contains(expected), "{error}");
         // rows are not hashed: the part's own digest says that they are those that were written
-        if !expected.contains("manifest's digest") {
+        if !expected.contains("manifest's digest") && !expected.contains("content digest") {
             let error = message(super::rows::read(&path, &[0, 1, 2]));
             assert!(error.contains(expected), "{error}");
         }
@@ -519,8 +519,13 @@ fn doubled_missing_or_mistyped_rows_are_errors_even_when_every_digest_is_right()
         let path = directory.path().join(name);
         forge(&original, &path, &batch);
         let all = [0, 1, 2];
-        for error in [message(read(&path)), message(super::rows::read(&path, &all))] {
+        let found = |error: String| {
             assert!(error.starts_with("damaged: ") && error.contains(expected), "{name}: {error}");
+        };
+        found(message(read(&path)));
+        // what a learner does not read, agents' own rewards, is not looked for
+        if name != "narrow" {
+            found(super::rows::read(&path, &all).map(|_| name).unwrap_err().to_string());
         }
     }
 }
