@@ -2,6 +2,7 @@
 #![expect(clippy::print_stderr, reason = "the face of the program prints")]
 
 mod args;
+mod calibrate;
 mod convert;
 mod estimate_mi;
 mod evaluate;
@@ -57,6 +58,8 @@ enum Command {
     Pairs(pairs::Args),
     /// Estimate how much messages and actions, or any columns, tell about each other
     EstimateMi(estimate_mi::Args),
+    /// Test estimators on forty distributions of known information
+    Calibrate(calibrate::Args),
     /// Train a team over a link prior
     Train(train::Args),
     /// Test a trained team on every channel of a suite
@@ -111,6 +114,7 @@ fn dispatch(command: Command) -> anyhow::Result<Outcome> {
         Command::Convert(args) => convert::run(&args),
         Command::Pairs(args) => pairs::run(&args),
         Command::EstimateMi(args) => estimate_mi::run(&args),
+        Command::Calibrate(args) => calibrate::run(&args),
         Command::Train(args) => train::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Report(args) => report::run(&args),
