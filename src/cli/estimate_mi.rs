@@ -19,6 +19,7 @@ const EXAMPLES: &str = "\
 Examples:
   ccmarl estimate-mi data/tag
   ccmarl estimate-mi data/tag.mcap --estimator jsd,club,gaussian --delivered
+  ccmarl estimate-mi table.csv --x a --y b --estimator auto
   ccmarl estimate-mi table.parquet --x a,b --y c --estimator gaussian,jsd --group subject
   ccmarl estimate-mi table.csv --x a --y b --estimator ksg,ksg:10,gcmi
   ccmarl estimate-mi table.csv --x a --y b --given c --estimator gaussian,ksg --unit bits
@@ -31,6 +32,7 @@ For a store: x is the message that the sender sent, y the action of the receiver
 delivered and lost apart. Values are in nats unless the unit says jsd. p: episodes permuted.
 In a CSV an empty cell and NaN are missing. Columns of words are categories: discrete and ksg-mixed take them.
 The rows mean:
+  auto           one value: chosen by types, ties, width and size, and by what several estimators say
   jsd            2·JSD of the critic, 0 to 2 ln 2: a lower bound on its own scale, not nats
   jsd-plugin     the same critic's estimate of the information, nats
   jsd-nwj, -dv   lower bounds by the same critic, nats; jsd-certified: what the JSD alone proves
@@ -109,7 +111,7 @@ pub(super) struct Args {
 }
 
 /// The help of `--estimator`.
-fn estimators() -> String {
+pub(super) fn estimators() -> String {
     let names: Vec<&str> = ESTIMATORS.iter().map(|e| e.name).collect();
     format!(
         "Estimators, comma-separated, name or name:k: {} (`ccmarl list estimator` describes them)",
@@ -190,7 +192,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         io::write_atomic(path, &bytes).map_err(Error::from)?;
         ui::say(&format!("wrote {} rows: {}", rows.len(), path.display()));
     }
-    if let Some(target) = plot {
+    if let Some(target) = &plot {
         heatmap::draw(&rows, target)?;
     }
     match args.format {
@@ -202,21 +204,27 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     for (job, error) in &failures {
         ui::say(&format!("warning: no {} for {}: {error}", job.estimator, place(&job.labels)));
     }
-    let warned = rows.iter().filter(|r| !r.warnings.is_empty()).count() + failures.len();
+    let warned = rows.iter().filter(|r| r.warnings.iter().any(|w| !w.starts_with(mi::NOTE))).count() + failures.len();
     anyhow::ensure!(!args.strict || warned == 0, "{warned} results carry warnings, and --strict was given");
     Ok(Outcome::Done)
 }
 
 fn plan(args: &Args) -> Result<Plan, Error> {
-    let mut estimators = Vec::new();
-    for text in &args.estimator {
+    let protocol = Protocol { permutations: args.permutations as usize };
+    Ok(Plan { estimators: named(&args.estimator)?, protocol, seed: args.seed })
+}
+
+/// The estimators of these names, each once.
+pub(super) fn named(names: &[String]) -> Result<Vec<mi::Named>, Error> {
+    let mut estimators: Vec<mi::Named> = Vec::new();
+    for text in names {
         let spec = Spec::parse("estimator", ESTIMATORS, text)?;
         let entry = find("estimator", ESTIMATORS, &spec.name)?;
         if !estimators.iter().any(|(name, _)| *name == spec.to_string()) {
             estimators.push((spec.to_string(), (entry.build)(&spec)?));
         }
     }
-    Ok(Plan { estimators, protocol: Protocol { permutations: args.permutations as usize }, seed: args.seed })
+    Ok(estimators)
 }
 
 fn writer(path: &Path, input: &Path, force: bool) -> anyhow::Result<Write> {
@@ -315,7 +323,7 @@ fn place(labels: &SampleLabels) -> String {
 }
 
 /// Four decimals, and no minus sign before a zero.
-fn decimals(value: f64) -> String {
+pub(super) fn decimals(value: f64) -> String {
     let text = format!("{value:.4}");
     if text == "-0.0000" { "0.0000".to_owned() } else { text }
 }
@@ -368,7 +376,8 @@ fn print(rows: &[Estimate], samples: &[Samples]) -> anyhow::Result<()> {
     for (warning, places) in warnings {
         let shown = places.iter().take(3).map(String::as_str).collect::<Vec<_>>().join(", ");
         let more = if places.len() > 3 { format!(" and {} more", places.len() - 3) } else { String::new() };
-        ui::print(&format!("warning: {} ({}{more})", io::printable(warning), io::printable(&shown)))?;
+        let kind = if warning.starts_with(mi::NOTE) { "" } else { "warning: " };
+        ui::print(&format!("{kind}{} ({}{more})", io::printable(warning), io::printable(&shown)))?;
     }
     Ok(())
 }

@@ -26,7 +26,7 @@ pub(super) fn target(path: &Path, force: bool) -> Result<Target, Error> {
 }
 
 /// Draws the rows of the first estimator that has a finite value.
-pub(super) fn draw(rows: &[Estimate], target: Target) -> anyhow::Result<()> {
+pub(super) fn draw(rows: &[Estimate], target: &Target) -> anyhow::Result<()> {
     let Some(first) = rows.iter().find(|r| r.value.is_finite()) else {
         anyhow::bail!("no finite value to draw: {}", target.path.display());
     };

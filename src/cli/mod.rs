@@ -2,6 +2,7 @@
 #![expect(clippy::print_stderr, reason = "the face of the program prints")]
 
 mod args;
+mod calibrate;
 mod convert;
 mod estimate_mi;
 mod evaluate;
@@ -63,6 +64,8 @@ enum Command {
     FitLink(fit_link::Args),
     /// Show what a link does
     Link(link::Args),
+    /// Test estimators on forty distributions of known information
+    Calibrate(calibrate::Args),
     /// Train a team over a link prior
     Train(train::Args),
     /// Test a trained team on every channel of a suite
@@ -119,6 +122,7 @@ fn dispatch(command: Command) -> anyhow::Result<Outcome> {
         Command::EstimateMi(args) => estimate_mi::run(&args),
         Command::FitLink(args) => fit_link::run(&args),
         Command::Link(args) => link::run(&args),
+        Command::Calibrate(args) => calibrate::run(&args),
         Command::Train(args) => train::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Report(args) => report::run(&args),

@@ -64,7 +64,9 @@ impl Objective {
                     grads.iter_mut().zip(others).for_each(|(g, t)| *g = (t - most).exp());
                     let own = (own - most).exp();
                     let total = own + grads.iter().sum::<f32>();
-                    grads.iter_mut().for_each(|g| *g *= scale / total);
+                    for grad in grads {
+                        *grad *= scale / total;
+                    }
                     grad_positive[i] = -scale * (1.0 - own / total);
                 }
             }

@@ -14,13 +14,17 @@ use crate::registry::{RegistryError, Spec};
 use crate::rng::{self, Seeds, Stream};
 use crate::schema::Samples;
 
+/// Every score as it is.
+const ANY: (f32, f32) = (f32::NEG_INFINITY, f32::INFINITY);
+/// Validation rows that the range of scores is taken from.
+const VALIDATED: usize = 4096;
 /// Share of the mean of e^T that one sample may have before the value is said to hang on it.
 const HEAVY: f64 = 0.1;
 
 /// How the value is read off held-out scores.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Reading {
-    /// InfoNCE over all rows that are scored against each other.
+    /// `InfoNCE` over all rows that are scored against each other.
     InfoNce,
     /// E\[T\] + 1 − E\[e^T\].
     Nwj,
@@ -102,10 +106,13 @@ impl Contrast {
         let diverged = || MiError::Diverged { columns: format!("{} and {}", samples.labels.x, samples.labels.y) };
         let Fit { params, steps, .. } = fit(&mut model, &data, seeds).ok_or_else(diverged)?;
         let held_out = data.train.len().min(data.test.len());
-        let trained_on = self.held(&mut model.scorer, &params, &data, &data.train[..held_out], seeds);
-        let trained_on = trained_on.values(self.reading);
+        // a critic held to the range of its validation scores is a critic too, and stays sane far from all data
+        let looked = &data.validation[..data.validation.len().min(VALIDATED)];
+        let validated = self.held(&mut model.scorer, &params, &data, looked, ANY, seeds);
+        let mut held = |rows: &[u32]| self.held(&mut model.scorer, &params, &data, rows, validated.range, seeds);
+        let trained_on = held(&data.train[..held_out]).values(self.reading);
         let trained_on = trained_on.iter().sum::<f64>() / held_out as f64;
-        let held = self.held(&mut model.scorer, &params, &data, &data.test, seeds);
+        let held = held(&data.test);
         let of = block_interval(&held.values(self.reading), &data.test_blocks);
         if !of.mean.is_finite() {
             return Err(diverged());
@@ -121,7 +128,7 @@ impl Contrast {
             (row.interval_low, row.interval_high) = (Some(of.low), Some(of.high));
         }
         row.p_value = null(&mut model.scorer, &params, samples, &data, protocol, seeds);
-        row.warnings = data.warnings.clone();
+        row.warnings.clone_from(&data.warnings);
         row.warnings.extend(tied(samples));
         row.warnings.extend(self.warnings(&held, trained_on, of));
         Ok(row)
@@ -147,8 +154,16 @@ impl Contrast {
         out
     }
 
-    /// Scores of these rows, each against all others of its square.
-    fn held(&self, scorer: &mut Scorer, params: &[f32], data: &Prepared, rows: &[u32], seeds: &Seeds) -> Held {
+    /// Scores of these rows, each against all others of its square; the scores held to a range.
+    fn held(
+        &self,
+        scorer: &mut Scorer,
+        params: &[f32],
+        data: &Prepared,
+        rows: &[u32],
+        (least, most): (f32, f32),
+        seeds: &Seeds,
+    ) -> Held {
         let n = rows.len();
         let order = rng::permutation(&mut seeds.stream("squares"), n);
         let squares = n.div_ceil(self.critic.square());
@@ -158,9 +173,10 @@ impl Contrast {
             infonce: vec![0.0; n],
             exponential: vec![0.0; n],
             mean: 0.0,
+            range: (f32::INFINITY, f32::NEG_INFINITY),
             side: n / squares,
         };
-        let (mut x, mut y) = (Vec::new(), Vec::new());
+        let (mut x, mut y, mut within) = (Vec::new(), Vec::new(), Vec::new());
         let mut total = 0.0;
         for square in 0..squares {
             // random squares: the others of a row come from all episodes, not from its own
@@ -172,9 +188,18 @@ impl Contrast {
             scorer.scores(params, &x, &y, own.len(), &others);
             let k = own.len() - 1;
             for (at, (&i, others_of)) in members.iter().zip(scorer.negative().chunks_exact(k)).enumerate() {
-                out.positive[i] = f64::from(scorer.positive()[at]);
-                out.infonce[i] = infonce(scorer.positive()[at], others_of);
-                for (&t, &j) in others_of.iter().zip(&others[at * k..(at + 1) * k]) {
+                let own = scorer.positive()[at].max(least).min(most);
+                out.positive[i] = f64::from(own);
+                within.clear();
+                within.extend(others_of.iter().map(|t| t.max(least).min(most)));
+                out.infonce[i] = infonce(own, &within);
+                out.range.0 = within.iter().fold(out.range.0.min(own), |a, &t| a.min(t));
+                out.range.1 = out.range.1.max(own);
+                if self.reading == Reading::InfoNce {
+                    // its scores have a level of their own for every x
+                    out.range.1 = within.iter().fold(out.range.1, |a, &t| a.max(t));
+                }
+                for (&t, &j) in within.iter().zip(&others[at * k..(at + 1) * k]) {
                     let e = libm::exp(f64::from(t.clamp(-clip, clip))) / k as f64;
                     out.exponential[i] += e;
                     out.exponential[members[j as usize]] += e;
@@ -185,7 +210,9 @@ impl Contrast {
         out.mean = total / n as f64;
         // a pair belongs to its row and to its column: both at once would count the mean twice
         let mean = out.mean;
-        out.exponential.iter_mut().for_each(|e| *e -= mean);
+        for e in &mut out.exponential {
+            *e -= mean;
+        }
         out
     }
 }
@@ -194,11 +221,13 @@ impl Contrast {
 struct Held {
     /// T of each pair.
     positive: Vec<f64>,
-    /// InfoNCE of each row.
+    /// `InfoNCE` of each row.
     infonce: Vec<f64>,
     /// What each row, as a row and as a column, contributes to the mean of e^T; its mean is `mean`.
     exponential: Vec<f64>,
     mean: f64,
+    /// Least score of any two rows, and greatest of a pair (`InfoNCE`: of any two).
+    range: (f32, f32),
     /// Rows scored against each other.
     side: usize,
 }
@@ -269,6 +298,7 @@ mod tests {
             infonce: vec![positive; n],
             exponential: exponential.to_vec(),
             mean: exponential.iter().sum::<f64>() / n as f64,
+            range: ANY,
             side: n,
         }
     }
@@ -322,7 +352,7 @@ mod tests {
         let mut scorer = Scorer::new(CriticKind::Separable, 1, 1);
         let params: Vec<f32> =
             scorer.init(&mut seeds.stream("init")).iter().map(|p| p + 0.2 * rng::normal(&mut rng) as f32).collect();
-        let held = NWJ.held(&mut scorer, &params, &data, &rows, &seeds);
+        let held = NWJ.held(&mut scorer, &params, &data, &rows, ANY, &seeds);
         // one square: the bounds over all n (n − 1) pairs, whatever their order
         scorer.scores(&params, &data.x, &data.y, n, &all_others(n));
         let readings = [

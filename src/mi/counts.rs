@@ -102,6 +102,11 @@ impl Table {
         self.joint.len() as f64 - (x + y) as f64 + 1.0
     }
 
+    /// Pairs of categories that occur.
+    pub(super) fn pairs(&self) -> usize {
+        self.joint.len()
+    }
+
     /// Categories of x, and of y, that occur.
     pub(super) fn occurring(&self) -> [usize; 2] {
         [&self.x, &self.y].map(|counts| counts.iter().filter(|&&c| c > 0).count())

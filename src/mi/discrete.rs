@@ -21,7 +21,8 @@
 //! # When it fails
 //!
 //! Continuous columns: every value is a category of its own, and the value is ln n whatever the dependence. With few
-//! samples per pair of categories the bias is no longer as Miller and Madow have it. Both are said.
+//! samples per pair of categories the bias is no longer as Miller and Madow have it; with less than two there is no
+//! interval. All this is said.
 //!
 //! # Reference
 //!
@@ -98,9 +99,14 @@ impl Estimator for Discrete {
             warnings.push(NO_NULL.to_owned());
         }
         for (distinct, label) in [(distinct_x, &labels.x), (distinct_y, &labels.y)] {
-            if distinct > 20 && distinct * 2 > n {
+            if distinct > 2 && distinct * 2 > n {
                 warnings.push(format!("{label} has {distinct} values in {n} samples: take ksg for continuous columns"));
             }
+        }
+        // where most pairs of categories occur once, their frequencies say nothing about the error either
+        let crowded = table.pairs() * 2 > n;
+        if crowded {
+            warnings.push(format!("{} pairs of categories in {n} samples: no interval", table.pairs()));
         }
         if bias > BIASED {
             warnings.push(format!(
@@ -116,7 +122,7 @@ impl Estimator for Discrete {
             let mut row = Estimate::new(name, labels, value, Unit::Nats, Kind::Estimate, n);
             row.n_effective = local.n_effective;
             row.p_value = p_value(table.information(), null.as_deref().unwrap_or_default());
-            if local.blocks > 1 {
+            if local.blocks > 1 && !crowded {
                 (row.interval_low, row.interval_high) =
                     (Some(local.mean - bias - half), Some(local.mean - bias + half));
             }

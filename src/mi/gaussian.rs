@@ -107,9 +107,11 @@ pub(super) fn estimate(name: &str, samples: &Samples, protocol: Protocol, seeds:
     if value.is_infinite() {
         warnings.push(copy(labels));
     } else {
-        interval(&mut out, &total, &parts, dx + dy + given, &information);
         let local = local_information(samples, &x, &y, &total);
         out.n_effective = block_interval(&local, &blocks).n_effective;
+        // without dependence the value is χ² with d_x d_y degrees of freedom over 2n, whose scatter a jackknife misses
+        let remains = libm::sqrt((dx * dy) as f64 / 2.0) / out.n_effective;
+        interval(&mut out, &total, &parts, dx + dy + given, remains, &information);
         if parts.len() < 10 {
             warnings.push(format!("few blocks: the interval rests on {} episodes", parts.len()));
         }
@@ -228,12 +230,13 @@ fn local_information(samples: &Samples, x: &Scaled<'_>, y: &Scaled<'_>, total: &
     samples.rows.iter().map(local).collect()
 }
 
-/// Jackknife over the parts: error² = (G − 1)/G Σ (`θ_g` − θ̄)².
+/// Jackknife over the parts, error² = (G − 1)/G Σ (`θ_g` − θ̄)², joined with the error that remains without dependence.
 fn interval(
     out: &mut Estimate,
     total: &Moments,
     parts: &[Moments],
     width: usize,
+    remains: f64,
     information: &dyn Fn(&Moments) -> f64,
 ) {
     let g = parts.len() as f64;
@@ -251,7 +254,7 @@ fn interval(
     if parts.len() < 2 || !error.is_finite() {
         return;
     }
-    let half = error * t_quantile(parts.len());
+    let half = libm::hypot(error, remains) * t_quantile(parts.len());
     (out.interval_low, out.interval_high) = (Some(out.value - half), Some(out.value + half));
 }
 

@@ -7,6 +7,7 @@
 //!
 //! I ≥ mean\[T(`x_i`, `y_i`) − ln `mean_j` e^T(`x_i`, `y_j`)\], j over all K rows of a random square of held-out rows, K at most
 //! 1024 (256 for the concatenated critic).
+//! T is held to the range that its scores have on the validation part.
 //!
 //! # Shapes and units
 //!
@@ -24,7 +25,7 @@
 //!
 //! # Reference
 //!
-//! van den Oord, Li, Vinyals 2018, arXiv 1807.03748; the ceiling: McAllester, Stratos 2020.
+//! van den Oord, Li, Vinyals 2018, arXiv 1807.03748; the ceiling: `McAllester`, Stratos 2020.
 //!
 //! # Differences from the reference implementation
 //!

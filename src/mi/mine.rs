@@ -7,6 +7,7 @@
 //! I ≥ `E_p`\[T\] − ln `E_q`\[e^T\], p the pairs, q the product of the margins: all pairs of different rows within random squares of
 //! at most 1024 (256) held-out rows. In training the gradient of the second term is that of `E_q`\[e^T\] over its running
 //! mean (0.99 per step).
+//! T is held to the range that its scores have on the validation part.
 //!
 //! # Shapes and units
 //!

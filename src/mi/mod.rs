@@ -10,7 +10,9 @@
 //! `scorer`, `bounds` and `contrast` (trained critics), `linear` (covariances), `given` (z), `knn` and `neighbours`, `counts`.
 
 pub(crate) mod all_pairs;
+mod auto;
 mod bounds;
+mod calibrate;
 mod club;
 mod club_sample;
 pub mod conditional;
@@ -44,14 +46,18 @@ mod run;
 mod scorer;
 pub(crate) mod shifted;
 mod smile;
+mod tasks;
 
+pub use calibrate::{Calibrated, calibrate};
 pub use estimate::{Estimate, Kind, Unit, is_estimates, to_csv, to_json, to_parquet};
+pub use estimate::{Estimate, Kind, Unit, to_csv, to_json, to_parquet};
 pub use interval::{Interval, block_interval};
 pub use jsd::certified;
 pub use negatives::{all_others, derangements};
 pub use neighbours::ksg1_value;
 pub use null::{p_value, permuted_rows};
 pub use run::{Job, JobResult, Named, Plan, run};
+pub use tasks::{TASKS, Task};
 
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
@@ -59,6 +65,7 @@ use crate::schema::Samples;
 
 /// All estimators.
 pub const ESTIMATORS: &[Entry<Build>] = &[
+    auto::ENTRY,
     club::ENTRY,
     club_sample::ENTRY,
     discrete::ENTRY,
@@ -75,6 +82,9 @@ pub const ESTIMATORS: &[Entry<Build>] = &[
     nwj::ENTRY,
     smile::ENTRY,
 ];
+
+/// What an entry of `warnings` begins with that explains and does not warn.
+pub const NOTE: &str = "note: ";
 
 /// Makes an estimator from its parameters.
 pub type Build = fn(&Spec) -> Result<Box<dyn Estimator>, RegistryError>;

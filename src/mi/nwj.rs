@@ -6,6 +6,7 @@
 //!
 //! I ≥ `E_p`\[T\] + 1 − `E_q`\[e^T\], p the pairs, q the product of the margins: all pairs of different rows within random squares
 //! of at most 1024 (256) held-out rows.
+//! T is held to the range that its scores have on the validation part.
 //!
 //! # Shapes and units
 //!

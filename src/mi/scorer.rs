@@ -39,8 +39,8 @@ impl CriticKind {
 
 /// A critic and what its last pass left.
 pub(super) enum Scorer {
-    Separable(Separable, CriticTape),
-    Concatenated(Concatenated),
+    Separable(Separable, Box<CriticTape>),
+    Concatenated(Box<Concatenated>),
 }
 
 /// A perceptron over `[x, y]`, the pairs that it scored last, and their scores.
@@ -56,15 +56,15 @@ pub(super) struct Concatenated {
 impl Scorer {
     pub(super) fn new(kind: CriticKind, x_width: usize, y_width: usize) -> Self {
         match kind {
-            CriticKind::Separable => Self::Separable(Separable::deep(x_width, y_width), CriticTape::default()),
-            CriticKind::Concatenated => Self::Concatenated(Concatenated {
+            CriticKind::Separable => Self::Separable(Separable::deep(x_width, y_width), Box::default()),
+            CriticKind::Concatenated => Self::Concatenated(Box::new(Concatenated {
                 mlp: Mlp::new(&[x_width + y_width, 64, 64, 1], Activation::Relu, Activation::Identity),
                 tape: Tape::default(),
                 pairs: Vec::new(),
                 positive: Vec::new(),
                 negative: Vec::new(),
                 grads: Vec::new(),
-            }),
+            })),
         }
     }
 
@@ -174,7 +174,9 @@ impl Concatenated {
             self.pairs.extend_from_slice(&x[i * x_width..(i + 1) * x_width]);
             self.pairs.extend_from_slice(&y[j * y_width..(j + 1) * y_width]);
         };
-        (0..n).for_each(|i| push(i, i));
+        for i in 0..n {
+            push(i, i);
+        }
         negatives.iter().enumerate().for_each(|(at, &j)| push(at / k, j as usize));
         let scores = self.mlp.forward(params, &self.pairs, n + negatives.len(), &mut self.tape);
         let (positive, negative) = scores.split_at(n);

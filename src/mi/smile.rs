@@ -7,6 +7,7 @@
 //!
 //! `E_p`\[T\] − ln `E_q`\[e^clip(T, −5, 5)\], p the pairs, q the product of the margins: all pairs of different rows within random
 //! squares of at most 1024 (256) held-out rows.
+//! T is held to the range that its scores have on the validation part.
 //!
 //! # Shapes and units
 //!

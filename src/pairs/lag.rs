@@ -28,7 +28,9 @@ pub fn lagged(samples: &Samples, lag: usize) -> Result<Samples, PairsError> {
     }
     // the last rows have no y of their own later on: they are no samples, and what stands there is never read
     let mut data = Vec::with_capacity(count * width);
-    (0..count).for_each(|r| data.extend_from_slice(samples.y.row((r + lag).min(count - 1))));
+    for r in 0..count {
+        data.extend_from_slice(samples.y.row((r + lag).min(count - 1)));
+    }
     let y = Columns { data, names: samples.y.names.clone(), words: samples.y.words.clone() };
     let mut out = Samples { y: Arc::new(y), rows, ..samples.clone() };
     out.labels.y = format!("{}[+{lag}]", samples.labels.y);

@@ -56,13 +56,13 @@ fn errors_name_the_remedy_and_have_the_right_exit_code() {
         (
             2,
             &[&table, "--x", "s", "--y", "b"],
-            "s holds words, not numbers: name other columns, or take one of discrete, ksg-mixed",
+            "s holds words, not numbers: name other columns, or take one of auto, discrete, ksg-mixed",
         ),
         (2, &[&table, "--given", "a"], "--x"),
         (
             2,
             &[&table, "--x", "a", "--y", "b", "--given", "g", "--estimator", "jsd"],
-            "it estimates nothing given z: leave out --given, or take one of discrete, gaussian, gcmi, ksg, ksg1, ksg-mixed",
+            "it estimates nothing given z: leave out --given, or take one of auto, discrete, gaussian, gcmi, ksg, ksg1, ksg-mixed",
         ),
         (
             1,
@@ -378,6 +378,50 @@ fn nearest_neighbours_and_ranks_read_the_flowers() {
         out.contains("ksg1:3") && out.contains("ksg2:5") && out.contains("ksg-mixed and discrete are made for such"),
         "{out}"
     );
+}
+
+#[test]
+fn auto_says_why_and_its_note_is_no_warning() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut rng = ccmarl::rng::Seeds::new(4).stream("auto");
+    let mut text = "a,b\n".to_owned();
+    for _ in 0..600 {
+        let a = ccmarl::rng::normal(&mut rng);
+        writeln!(text, "{a},{}", a + ccmarl::rng::normal(&mut rng)).unwrap();
+    }
+    let table = write(dir.path(), "normal.csv", &text);
+    let args = [table.as_str(), "--x", "a", "--y", "b", "--estimator", "auto", "--strict", "--permutations", "39"];
+    let (code, out, err) = run(&args);
+    assert_eq!(code, 0, "{out}{err}");
+    assert!(
+        out.contains("\nnote: ") && out.contains(" chosen: 2 continuous columns, 600 samples, the largest of gcmi"),
+        "{out}"
+    );
+    let words = run(&[&dataset("tables/titanic.csv"), "--x", "sex", "--y", "survived", "--estimator", "auto"]).1;
+    assert!(words.contains("note: discrete-mm chosen: sex and survived take few values"), "{words}");
+}
+
+#[test]
+fn calibrate_prints_errors_and_refuses_unknown_tasks() {
+    let calibrate = |args: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_ccmarl"));
+        let output = command.env_remove("COLUMNS").arg("calibrate").args(args).output().unwrap();
+        let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+        (output.status.code().unwrap(), text(output.stdout), text(output.stderr))
+    };
+    let args = ["--estimator", "gaussian,ksg", "--n", "500", "--seeds", "2", "--task", "dense-2-2,1v1-normal"];
+    let (code, out, err) = calibrate(&args);
+    assert_eq!(code, 0, "{err}");
+    assert!(
+        out.contains("multinormal-dense-2-2-0.5") && out.contains("0.2939") && out.contains("over all tasks"),
+        "{out}"
+    );
+    let (_, json, _) = calibrate(&[&args[..], &["--format", "json"]].concat());
+    let found: Value = serde_json::from_str(&json).unwrap();
+    // 1v1-normal and its CDF twin, its wiggly and half-cube ones, and the dense one
+    assert_eq!((found["tasks"].as_array().unwrap().len(), found["total"][0]["tasks"].as_u64()), (12, Some(6)));
+    let (code, _, err) = calibrate(&["--task", "zzz"]);
+    assert!(code == 2 && err.contains("no task contains zzz; the tasks are 1v1-normal-0.75"), "{err}");
 }
 
 fn assert_golden(case: &str, found: &Value, golden: &Value) {

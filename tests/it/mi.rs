@@ -111,6 +111,21 @@ fn independent_wide_data_give_no_neural_bound_anything() {
 }
 
 #[test]
+fn tails_without_variance_leave_every_bound_sane() {
+    // Student's t with one degree of freedom: 0.224 nats
+    let task = ccmarl::mi::TASKS.iter().find(|t| t.id == "student-identity-1-1-1").unwrap();
+    let samples = task.samples(3000, &mut Seeds::new(1).stream("tails"));
+    // smile is no bound: clipping lets it exceed the truth
+    let names = [&["infonce", "nwj", "mine"], &CONCATENATED[..3]].concat();
+    // raw columns without variance are a bad start, and these bounds may be loose; they were once at −1e18
+    for result in run(&[samples], &plan(&names, 0, 1), &|| ()) {
+        for row in result.rows.unwrap_or_default() {
+            assert!((-1e3..0.4).contains(&row.value), "{}: {}", row.estimator, row.value);
+        }
+    }
+}
+
+#[test]
 fn independent_data_give_zero() {
     let sets: Vec<Samples> = (0..4).map(|seed| probe(0.0, 420, 50 + seed)).collect();
     let rows = rows(&sets, &plan(&["gaussian", "jsd", "club"], 0, 1));
@@ -162,5 +177,57 @@ fn too_few_episodes_and_constant_columns_are_errors_of_every_trained_estimator()
         let error = result.rows.unwrap_err().to_string();
         let expected = ["needs at least 10 episodes to split by episode", "m is constant, so it can tell nothing"];
         assert!(expected.iter().any(|e| error.starts_with(e)), "{error}");
+    }
+}
+
+/// Two AR(1) series of 1000 rows in 50 blocks; the second follows the first by `coupling`.
+fn autoregressive(phi: f64, coupling: f64, seed: u64) -> Samples {
+    let mut rng = Seeds::new(seed).stream("ar");
+    let (mut a, mut b, mut x, mut y) = (0.0, 0.0, Vec::new(), Vec::new());
+    for t in 0..1200 {
+        (a, b) = (phi * a + normal(&mut rng), phi * b + normal(&mut rng));
+        if t >= 200 {
+            x.push(a);
+            y.push(b + coupling * a);
+        }
+    }
+    let mut samples = probe(0.0, 40, 0);
+    samples.x = Arc::new(Columns::new(x, vec!["x".to_owned()]));
+    samples.y = Arc::new(Columns::new(y, vec!["y".to_owned()]));
+    samples.starts = (0..=50).map(|b| 20 * b).collect::<Vec<_>>().into();
+    samples.exchange = Exchange::Shift;
+    samples
+}
+
+#[test]
+#[ignore = "minutes: coverage of intervals over 1000 replicates, and false positives on autocorrelated series"]
+fn coverage_and_false_positives_in_figures() {
+    let names = ["gaussian", "gcmi", "ksg1", "ksg-mixed"];
+    for (rho, truth) in [(0.0, 0.0), (0.75f64, 0.413_339)] {
+        let single = |seed: u64| {
+            let mut samples = probe(rho, 20, 5000 + seed);
+            let first: Vec<f64> = samples.y.data.iter().step_by(2).copied().collect();
+            samples.y = Arc::new(Columns::new(first, vec!["a0".to_owned()]));
+            samples.starts = (0..=500).collect::<Vec<_>>().into();
+            samples
+        };
+        let rows = rows(&(0..1000).map(single).collect::<Vec<_>>(), &plan(&names, 0, 1));
+        for name in ["gaussian", "gcmi", "ksg1:3", "ksg-mixed:3"] {
+            let own: Vec<&Estimate> = rows.iter().filter(|r| r.estimator == name).collect();
+            let inside = |r: &&&Estimate| r.interval_low.unwrap() <= truth && truth <= r.interval_high.unwrap();
+            let covered = own.iter().filter(inside).count();
+            println!("coverage n=500 rho={rho} {name}: {:.1} %", 100.0 * covered as f64 / own.len() as f64);
+        }
+    }
+    for phi in [0.0, 0.9, 0.98] {
+        for coupling in [0.0, 0.3] {
+            let sets: Vec<Samples> = (0..200).map(|seed| autoregressive(phi, coupling, seed)).collect();
+            let rows = rows(&sets, &plan(&["gaussian", "ksg1"], 39, 1));
+            for name in ["gaussian", "ksg1:3"] {
+                let own: Vec<&Estimate> = rows.iter().filter(|r| r.estimator == name).collect();
+                let found = own.iter().filter(|r| r.p_value.unwrap() <= 0.05).count();
+                println!("p <= 0.05, phi={phi} coupling={coupling} {name}: {:.1} %", 100.0 * found as f64 / 200.0);
+            }
+        }
     }
 }

@@ -1,0 +1,156 @@
+//! Estimators on tasks of known information: how far off, and how often the interval holds the truth.
+
+use std::collections::BTreeMap;
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::tasks::Task;
+use super::{Estimate, Kind, Plan, Unit};
+use crate::rng::Seeds;
+
+/// One estimator on one task, over seeds.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Calibrated {
+    /// Task.
+    pub task: String,
+    /// Its information, nats.
+    pub truth: f64,
+    /// Estimator.
+    pub estimator: String,
+    /// What its value is to the truth.
+    pub kind: Kind,
+    /// Seeds that gave a finite value.
+    pub seeds: usize,
+    /// Mean of the values, nats.
+    pub mean: f64,
+    /// Standard deviation of the values, nats; none of one seed.
+    pub deviation: Option<f64>,
+    /// Mean absolute error, nats.
+    pub error: f64,
+    /// Share of the intervals that hold the truth; none without intervals.
+    pub covered: Option<f64>,
+}
+
+impl Calibrated {
+    /// Whether the mean is within a tenth of the truth, or 0.03 nats.
+    pub fn is_right(&self) -> bool {
+        (self.mean - self.truth).abs() <= (0.1 * self.truth).max(0.03)
+    }
+}
+
+/// The rows of one estimator by their names, in the order of first appearance.
+type ByName = Vec<(String, Vec<Estimate>)>;
+
+/// Runs every estimator of the plan on `seeds` draws of `n` samples of every task, in parallel; `done` is called after each
+/// draw. Rows come by task and then by estimator; values on another scale than nats are left out.
+pub fn calibrate(tasks: &[Task], plan: &Plan, n: usize, seeds: u64, done: &(dyn Fn() + Sync)) -> Vec<Calibrated> {
+    let root = Seeds::new(plan.seed).child("calibrate");
+    let draws: Vec<(usize, u64)> = (0..tasks.len()).flat_map(|t| (0..seeds).map(move |s| (t, s))).collect();
+    let run = |&(t, seed): &(usize, u64)| {
+        let own = root.child(tasks[t].id).indexed("seed", seed);
+        let samples = tasks[t].samples(n, &mut own.stream("samples"));
+        let of = |(place, (name, estimator)): (usize, &super::Named)| {
+            let rows = estimator.estimate(&samples, &plan.protocol, &own.child(name)).unwrap_or_default();
+            rows.into_iter().map(move |row| (place, row))
+        };
+        let rows: Vec<(usize, Estimate)> = plan.estimators.iter().enumerate().flat_map(of).collect();
+        done();
+        (t, rows)
+    };
+    let results: Vec<(usize, Vec<(usize, Estimate)>)> = draws.par_iter().map(run).collect();
+    // by task, by estimator as asked, and by its rows as they come
+    let mut groups: BTreeMap<(usize, usize), ByName> = BTreeMap::new();
+    for (t, rows) in results {
+        let finite = |r: &(usize, Estimate)| r.1.unit == Unit::Nats && r.1.value.is_finite();
+        for (place, row) in rows.into_iter().filter(finite) {
+            let group = groups.entry((t, place)).or_default();
+            match group.iter().position(|(name, _)| *name == row.estimator) {
+                Some(at) => group[at].1.push(row),
+                None => group.push((row.estimator.clone(), vec![row])),
+            }
+        }
+    }
+    let summaries = |((t, _), group): ((usize, usize), ByName)| {
+        group.into_iter().map(move |(estimator, rows)| summary(&tasks[t], estimator, &rows))
+    };
+    groups.into_iter().flat_map(summaries).collect()
+}
+
+fn summary(task: &Task, estimator: String, rows: &[Estimate]) -> Calibrated {
+    let n = rows.len() as f64;
+    let mean = rows.iter().map(|r| r.value).sum::<f64>() / n;
+    let squares: f64 = rows.iter().map(|r| (r.value - mean) * (r.value - mean)).sum();
+    let intervals: Vec<(f64, f64)> = rows.iter().filter_map(|r| r.interval_low.zip(r.interval_high)).collect();
+    let holding = intervals.iter().filter(|(low, high)| *low <= task.truth && task.truth <= *high).count();
+    Calibrated {
+        task: task.id.to_owned(),
+        truth: task.truth,
+        estimator,
+        kind: rows[0].kind,
+        seeds: rows.len(),
+        mean,
+        deviation: (rows.len() > 1).then(|| libm::sqrt(squares / (n - 1.0))),
+        error: rows.iter().map(|r| (r.value - task.truth).abs()).sum::<f64>() / n,
+        covered: (!intervals.is_empty()).then(|| holding as f64 / intervals.len() as f64),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mi::TASKS;
+    use crate::mi::run::tests::plan;
+
+    #[test]
+    fn exact_estimators_are_right_on_their_own_tasks_and_seeds_and_threads_do_not_mix() {
+        let tasks: Vec<Task> = TASKS.iter().filter(|t| t.id.starts_with("multinormal-dense-3")).copied().collect();
+        let found = calibrate(&tasks, &plan(&["gaussian", "ksg1"], 0, 1), 2000, 10, &|| ());
+        assert_eq!(found.iter().map(|c| c.estimator.as_str()).collect::<Vec<_>>(), ["gaussian", "ksg1:3"]);
+        let gaussian = &found[0];
+        assert!(gaussian.is_right() && gaussian.error < 0.03 && gaussian.covered.unwrap() >= 0.7, "{gaussian:?}");
+        assert!(gaussian.seeds == 10 && gaussian.deviation.unwrap() < 0.04, "{gaussian:?}");
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+        let alone = pool.install(|| calibrate(&tasks, &plan(&["gaussian"], 0, 1), 2000, 10, &|| ()));
+        assert_eq!(alone[0], found[0]);
+    }
+
+    #[test]
+    fn an_estimator_that_fails_on_a_draw_leaves_the_others_in_their_places() {
+        struct Moody;
+        impl crate::mi::Estimator for Moody {
+            fn estimate(
+                &self,
+                samples: &crate::schema::Samples,
+                _: &crate::mi::Protocol,
+                _: &Seeds,
+            ) -> Result<Vec<Estimate>, crate::mi::MiError> {
+                if samples.x.data[0] > 0.0 {
+                    return Err(crate::mi::MiError::Diverged { columns: String::new() });
+                }
+                Ok(vec![Estimate::new("moody", &samples.labels, 0.5, Unit::Nats, Kind::Estimate, 9)])
+            }
+        }
+        let mut plan = plan(&["gaussian"], 0, 1);
+        plan.estimators.insert(0, ("moody".to_owned(), Box::new(Moody)));
+        let found = calibrate(&TASKS[..1], &plan, 50, 20, &|| ());
+        let names: Vec<(&str, bool)> = found.iter().map(|c| (c.estimator.as_str(), c.seeds == 20)).collect();
+        assert_eq!(names, [("moody", false), ("gaussian", true)]);
+    }
+
+    #[test]
+    fn a_summary_by_hand() {
+        let labels = crate::schema::SampleLabels::default();
+        let row = |value, low, high| {
+            let mut row = Estimate::new("e", &labels, value, Unit::Nats, Kind::Estimate, 9);
+            (row.interval_low, row.interval_high) = (Some(low), Some(high));
+            row
+        };
+        let task = TASKS[3];
+        let rows = [row(0.3, 0.2, 0.32), row(0.4, 0.3, 0.5)];
+        let found = summary(&task, "e".to_owned(), &rows);
+        assert!((found.mean - 0.35).abs() < 1e-12 && (found.error - 0.05).abs() < 1e-12);
+        assert!((found.deviation.unwrap() - 0.005f64.sqrt()).abs() < 1e-12);
+        assert_eq!((found.covered, found.is_right()), (Some(0.5), true));
+    }
+}
