@@ -50,7 +50,6 @@ mod tasks;
 
 pub use calibrate::{Calibrated, calibrate};
 pub use estimate::{Estimate, Kind, Unit, is_estimates, to_csv, to_json, to_parquet};
-pub use estimate::{Estimate, Kind, Unit, to_csv, to_json, to_parquet};
 pub use interval::{Interval, block_interval};
 pub use jsd::certified;
 pub use negatives::{all_others, derangements};
