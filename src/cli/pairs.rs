@@ -25,7 +25,7 @@ steps with an action. Memory stays bounded, however large the store.";
 pub(super) struct Args {
     /// A directory, .parquet or .mcap file that `ccmarl record` made
     store: PathBuf,
-    /// Parquet file to write
+    /// Parquet file to write, x.parquet
     #[arg(long)]
     out: PathBuf,
     /// Replace the file if ccmarl wrote it
@@ -38,6 +38,10 @@ pub(super) struct Args {
 
 /// Runs the command.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    if args.out.extension().is_none_or(|ending| ending != "parquet") {
+        let message = format!("--out: a table of pairs is a .parquet file, found {}", args.out.display());
+        return Err(Error::Usage(message).into());
+    }
     crate::io::refuse_existing(&args.out, args.force).map_err(Error::from)?;
     storage::refuse_within_store(&args.out).map_err(Error::from)?;
     end_on_signals()?; // until there is something to clean up

@@ -1,6 +1,6 @@
 //! `ccmarl train`: a learner on a scenario over a link prior, into a run directory.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
 use serde_json::json;
@@ -71,7 +71,7 @@ pub(super) struct Args {
     /// Store whose episodes fill replay and rings before the first step
     #[arg(long, value_name = "STORE", conflicts_with = "resume")]
     warm_start: Option<PathBuf>,
-    /// Store that takes the run's own rollouts
+    /// Store that takes the run's own rollouts; it must not exist, --force does not replace it
     #[arg(long, value_name = "STORE", conflicts_with = "resume")]
     record: Option<PathBuf>,
     /// Go on from the checkpoint in --out, under its own configuration
@@ -115,10 +115,10 @@ impl Args {
             return Err(TrainError::Resume { message, path: self.out.clone() }.into());
         }
         let file = self.config.as_deref().or(own.as_deref()).map(TrainConfig::read).transpose()?;
-        let spec = self.scenario.spec(file.as_ref().map(|c| c.scenario.clone()))?;
-        let spec = spec.unwrap_or_else(|| Spec::new("simple_spread"));
-        let mut config = file.unwrap_or_else(|| TrainConfig::new(spec.clone(), "cc-maddpg"));
-        config.scenario = spec;
+        let mut config = file.unwrap_or_else(|| TrainConfig::new(Spec::new("simple_spread"), "cc-maddpg"));
+        if let Some(spec) = self.scenario.spec(Some(config.scenario.clone()))? {
+            config.scenario = spec;
+        }
         if let Some(algorithm) = &self.algorithm {
             config.algorithm.clone_from(algorithm);
         }
@@ -139,8 +139,21 @@ impl Args {
     }
 }
 
+/// Refuses a store inside the run directory, or around it: each would replace the other.
+fn refuse_overlap(out: &Path, record: &Path) -> anyhow::Result<()> {
+    let [run, store] = [std::path::absolute(out)?, std::path::absolute(record)?];
+    if run.starts_with(&store) || store.starts_with(&run) {
+        let message = format!("--record and --out need places of their own, found {}", record.display());
+        return Err(Error::Usage(message).into());
+    }
+    Ok(())
+}
+
 /// Runs the command.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    if let Some(record) = &args.record {
+        refuse_overlap(&args.out, record)?;
+    }
     let config = args.config()?;
     let protocol = config.evaluation.protocol;
     let stop = stop_flag()?;
@@ -171,6 +184,13 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     }
     if report.interrupted {
         ui::say(&format!("interrupted and saved; go on with: ccmarl train --out {out} --resume"));
+        if let Some(store) = &args.record {
+            let episodes = report.episodes;
+            ui::say(&format!(
+                "the store ends here, at {episodes} episodes; what follows is not recorded: {}",
+                store.display()
+            ));
+        }
         return Ok(Outcome::Interrupted);
     }
     if protocol == Protocol::Paper {

@@ -181,6 +181,12 @@ fn label(
             }
         }
     }
+    let prior = run.prior.to_string();
+    let own = crate::algo::preset(name).is_ok_and(|preset| preset.prior == run.prior);
+    differing.retain(|key, _| !key.starts_with("prior."));
+    if !own {
+        differing.insert("prior", &prior);
+    }
     let name = printable(name);
     if differing.is_empty() {
         return name;

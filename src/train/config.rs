@@ -10,6 +10,9 @@ use crate::algo::{self, MaddpgConfig};
 use crate::registry::{RegistryError, Spec};
 use crate::scenario::Scenario;
 
+/// Most hidden layers, and most units in one: what fits in memory many times over.
+const WIDEST: [usize; 2] = [16, 4096];
+
 /// Largest configuration file that is read, bytes.
 const LIMIT: u64 = 1 << 20;
 
@@ -364,6 +367,11 @@ impl TrainConfig {
             positive("evaluation.episodes", self.evaluation.episodes() as usize),
             positive("maddpg.batch", m.batch.unwrap_or(0)),
             positive("maddpg.hidden", m.hidden.iter().copied().min().unwrap_or(0)),
+            (
+                "maddpg.hidden",
+                m.hidden.len() <= WIDEST[0] && m.hidden.iter().all(|&w| w <= WIDEST[1]),
+                format!("expected at most {} layers of at most {} units, found {:?}", WIDEST[0], WIDEST[1], m.hidden),
+            ),
             unit("maddpg.gamma", m.gamma),
             unit("maddpg.tau", m.tau),
             rate("maddpg.actor_learning_rate", m.actor_learning_rate),

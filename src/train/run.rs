@@ -12,7 +12,7 @@ use super::{TrainError, directory};
 pub struct Options<'a> {
     /// Store whose episodes fill replay and rings before the first step.
     pub warm_start: Option<&'a Path>,
-    /// Store that takes the run's own rollouts.
+    /// Store that takes the run's own rollouts; never replaced.
     pub record: Option<&'a Path>,
     /// Go on from the checkpoint in the run directory.
     pub resume: bool,
@@ -72,7 +72,7 @@ pub fn train(
         trainer.warm_start(crate::storage::open(path)?.as_mut())?;
     }
     let mut sink = match options.record {
-        Some(path) => Some(crate::storage::create(path, &trainer.manifest(), options.force)?),
+        Some(path) => Some(crate::storage::create(path, &trainer.manifest(), false)?), // data outlives a run
         None => None,
     };
     // nothing that was there is touched before everything that can be refused has been

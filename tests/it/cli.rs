@@ -168,3 +168,55 @@ fn every_command_of_the_readme_parses() {
         Cli::try_parse_from(words).map_err(|error| format!("{line}\n{error}")).unwrap();
     }
 }
+
+#[test]
+fn train_lays_scenario_flags_over_its_default_and_refuses_places_that_overlap() {
+    let dir = tempfile::tempdir().unwrap();
+    let run_dir = dir.path().join("run");
+    let out = run_dir.to_str().unwrap();
+    let (code, _, err) = run(&["train", "--agents", "4", "--steps", "25", "--out", out]);
+    assert_eq!(code, 0, "{err}");
+    let config = std::fs::read_to_string(run_dir.join("config.toml")).unwrap();
+    assert!(config.contains("name = \"simple_spread\"") && config.contains("agents = 4"), "{config}");
+
+    let other = dir.path().join("other");
+    let other = other.to_str().unwrap();
+    for (words, expected) in [
+        (vec!["--set", "nonsense=1"], "simple_spread: unknown field `nonsense`"),
+        (vec!["--record", "STORE"], "--record and --out need places of their own"),
+        (vec!["--record", other], "--record and --out need places of their own"),
+    ] {
+        let inside = format!("{other}/store");
+        let words = words.iter().map(|&word| if word == "STORE" { inside.as_str() } else { word });
+        let args: Vec<&str> = ["train", "--steps", "25", "--out", other].into_iter().chain(words).collect();
+        let (code, _, err) = run(&args);
+        assert!(code == 2 && err.contains(expected), "{code} {err}");
+        assert!(!std::path::Path::new(other).exists(), "{args:?} left something");
+    }
+}
+
+#[test]
+fn a_runs_force_does_not_replace_a_store() {
+    let dir = tempfile::tempdir().unwrap();
+    let [store, run_dir] = ["store", "run"].map(|name| dir.path().join(name).to_str().unwrap().to_owned());
+    assert_eq!(run(&["record", "--scenario", "simple_spread", "--episodes", "2", "--out", &store]).0, 0);
+    let (code, _, err) = run(&["train", "--steps", "25", "--out", &run_dir, "--record", &store, "--force"]);
+    assert!(code == 2 && err.contains("output exists"), "{code} {err}");
+    let (code, out, _) = run(&["inspect", &store, "--format", "json"]);
+    assert!(code == 0 && out.contains("\"episodes\": 2"), "{out}");
+    assert!(!std::path::Path::new(&run_dir).exists());
+}
+
+#[test]
+fn tables_of_pairs_and_networks_have_their_bounds() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name).to_str().unwrap().to_owned();
+    let (code, _, err) = run(&["pairs", &path("store"), "--out", &path("pairs.csv")]);
+    assert!(code == 2 && err.contains("a table of pairs is a .parquet file"), "{err}");
+    let config = "algorithm = \"maddpg\"\nscenario = { name = \"simple_spread\" }\n[maddpg]\nhidden = [20000000, 64]\n";
+    std::fs::File::create(path("c.toml"))
+        .and_then(|mut f| std::io::Write::write_all(&mut f, config.as_bytes()))
+        .unwrap();
+    let (code, _, err) = run(&["train", "--config", &path("c.toml"), "--out", &path("run")]);
+    assert!(code == 2 && err.contains("maddpg.hidden: expected at most 16 layers of at most 4096 units"), "{err}");
+}

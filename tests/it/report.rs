@@ -253,7 +253,7 @@ fn runs_that_differ_in_a_setting_are_two_rows_with_the_setting_in_their_names() 
     make_run(&dir.path().join("b"), "cc-maddpg", "name = \"dropout\"\np = 0.5", 1, -110.0);
     let summary = report(&[dir.path().to_owned()], &[], &dir.path().join("r")).unwrap();
     let names: Vec<&str> = summary.tables[0].rows.iter().map(|r| r.series.as_str()).collect();
-    assert_eq!(names, ["cc-maddpg (prior.p=0.2)", "cc-maddpg (prior.p=0.5)"]);
+    assert_eq!(names, ["cc-maddpg", "cc-maddpg (prior=dropout:0.5)"]);
     let published = |row: usize| summary.tables[0].rows[row].cells[0].as_ref().unwrap().published.is_some();
     assert!(published(0) && !published(1), "the paper has no cc-maddpg trained at dropout 0.5");
 }
