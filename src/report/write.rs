@@ -244,7 +244,7 @@ fn task_section(
     let mut pictures = Vec::new();
     if let Some(found) = curves::curves(runs)? {
         let spread = if found.bands {
-            "lines are means over seeds, bands their 95 % intervals; a series of fewer than 3 seeds is one thin line per run"
+            "means over seeds with 95 % intervals; thin lines: runs of fewer than 3 seeds"
         } else {
             "one thin line per run (no series has 3 seeds)"
         };
