@@ -141,6 +141,7 @@ impl Args {
 
 /// Runs the command.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    crate::storage::refuse_within_store(&args.out).map_err(Error::from)?;
     let config = args.config()?;
     let protocol = config.evaluation.protocol;
     let stop = stop_flag()?;
