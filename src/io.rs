@@ -63,6 +63,21 @@ pub fn refuse_existing(path: &Path, force: bool) -> Result<(), IoError> {
     if !force && path.symlink_metadata().is_ok() { Err(IoError::Exists(path.to_owned())) } else { Ok(()) }
 }
 
+/// Reads a whole file of at most `limit` bytes.
+///
+/// # Errors
+/// [`IoError::Os`] (also when the file is larger).
+pub fn read_bytes(path: &Path, limit: u64) -> Result<Vec<u8>, IoError> {
+    let mut bytes = Vec::new();
+    let file = File::open(path).map_err(IoError::os("open", path))?;
+    file.take(limit + 1).read_to_end(&mut bytes).map_err(IoError::os("read", path))?;
+    if bytes.len() as u64 > limit {
+        let too_large = std::io::Error::other(format!("larger than the limit of {limit} bytes"));
+        return Err(IoError::os("read", path)(too_large));
+    }
+    Ok(bytes)
+}
+
 /// Reads a whole text file of at most `limit` bytes.
 ///
 /// # Errors

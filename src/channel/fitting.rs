@@ -357,18 +357,15 @@ pub fn fit(
         }
     }
     let (chosen, behind) = choose(&candidates);
-    let mut compared: Vec<Compared> = candidates
-        .iter()
-        .zip(behind)
-        .map(|(c, (behind, error))| {
-            let outcome = FitOutcome::Scored { score: Score::of(&c.tallies, &seeds), behind, error };
-            Compared { model: c.model, outcome }
+    let scores: Vec<Score> = candidates.iter().map(|c| Score::of(&c.tallies, &seeds)).collect();
+    let held_out = scores[chosen].clone();
+    let scored = candidates.iter().zip(scores).zip(behind);
+    let mut compared: Vec<Compared> = scored
+        .map(|((c, score), (behind, error))| Compared {
+            model: c.model,
+            outcome: FitOutcome::Scored { score, behind, error },
         })
         .collect();
-    let score = match compared.get(chosen) {
-        Some(Compared { outcome: FitOutcome::Scored { score, .. }, .. }) => score.clone(),
-        _ => Score::of(&[], &seeds),
-    };
     compared
         .extend(refused.into_iter().map(|(model, reason)| Compared { model, outcome: FitOutcome::Refused { reason } }));
     let Candidate { model, fitted, .. } = candidates.swap_remove(chosen);
@@ -387,7 +384,7 @@ pub fn fit(
         messages: observations.messages(),
         lost: observations.lost.iter().filter(|&&lost| lost).count(),
         parameters: whole.parameters(observations, &Runs::sum(runs.iter())),
-        held_out: score,
+        held_out,
         compared,
         notes: whole.notes(observations, &runs, &seeds),
     })

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 use serde_json::Value;
 
 use super::ChannelError;
@@ -20,7 +20,8 @@ const WANTED_EPISODES: usize = 50;
 /// Where observations come from: what a fitted file says about its data.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct DataSource {
-    /// The path as given.
+    /// The path as given; in JSON what it looks like, since it need not be UTF-8.
+    #[serde(serialize_with = "shown")]
     pub path: PathBuf,
     /// Of a store the digest of its content, of a table that of the file; 64 hex digits.
     pub sha256: String,
@@ -34,6 +35,10 @@ pub struct DataSource {
     pub state_fields: Vec<String>,
     /// World units of one unit of `distance`.
     pub distance_unit: f64,
+}
+
+fn shown<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(&path.display())
 }
 
 /// Messages by episode, ordered pair and step, in this order; the row after the last action is one too.
@@ -273,6 +278,15 @@ mod tests {
             error,
             "distance needs the agents' positions, and a table of link bits has none: fit dropout or markov, or give a rollout store: t.csv"
         );
+    }
+
+    #[test]
+    fn a_path_that_is_not_utf_8_is_written_as_it_looks() {
+        use std::os::unix::ffi::OsStrExt as _;
+        let path = Path::new(std::ffi::OsStr::from_bytes(b"t\xff.csv"));
+        let source = Observations::of_trace(&trace(&[1, 0, 0, 1, 1, 1], &[0, 2, 3]), path).source;
+        assert_eq!(source.path, path, "errors name it as it is");
+        assert_eq!(serde_json::to_value(&source).unwrap()["path"], "t\u{fffd}.csv");
     }
 
     #[test]

@@ -7,6 +7,9 @@ use crate::schema::{Episode, Layout};
 /// World units per bin of distance.
 pub const BIN_WIDTH: f64 = 0.1;
 
+/// First line of the table of counts.
+const CSV_HEADER: &str = "sender,receiver,kind,at,messages,lost";
+
 /// Bins of distance; the last takes everything beyond.
 const BINS: usize = 100;
 
@@ -141,10 +144,15 @@ impl LinkStatistics {
         total
     }
 
+    /// Whether a file's bytes begin as [`Self::csv`] does.
+    pub fn is_csv(bytes: &[u8]) -> bool {
+        bytes.strip_prefix(CSV_HEADER.as_bytes()).is_some_and(|rest| rest.starts_with(b"\n"))
+    }
+
     /// One line per link and step, burst length or bin of distance: `sender,receiver,kind,at,messages,lost`; of a burst
     /// length `at`, `lost` is the number of bursts, and of a bin `at` its lower end, world units.
     pub fn csv(&self) -> String {
-        let mut lines = vec!["sender,receiver,kind,at,messages,lost".to_owned()];
+        let mut lines = vec![CSV_HEADER.to_owned()];
         for ((sender, receiver), observed) in self.links.iter().zip(&self.observed) {
             let mut line = |kind: &str, at: String, messages: String, lost: u64| {
                 lines.push(format!("{sender},{receiver},{kind},{at},{messages},{lost}"));

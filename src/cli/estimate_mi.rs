@@ -54,7 +54,7 @@ pub(super) struct Args {
     path: PathBuf,
     #[arg(long, value_name = "NAMES", value_delimiter = ',', default_value = "jsd,club,gaussian", help = estimators())]
     estimator: Vec<String>,
-    /// Table: columns of x, comma-separated; regex:PATTERN stands for all columns that it matches
+    /// Table: columns of x, comma-separated; regex:PATTERN, without a comma, is all columns that it matches
     #[arg(long, value_name = "COLUMNS", value_delimiter = ',')]
     x: Vec<String>,
     /// Table: columns of y, comma-separated
@@ -173,9 +173,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let plan = plan(args)?;
     let write = args.out.as_deref().map(|path| writer(path, &args.path, args.force)).transpose()?;
     let plot = args.plot.as_deref().map(|path| heatmap::target(path, args.force)).transpose()?;
-    if plot.is_some() && !args.all_pairs && !args.x.is_empty() {
-        let message = "--plot draws a matrix: give --all-pairs, or a store".to_owned();
-        return Err(Error::Usage(message).into());
+    if plot.is_some() {
+        refuse_undrawable(args)?;
     }
     let samples = samples(args)?;
     let threads = usize::from(args.threads);
@@ -192,21 +191,36 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         io::write_atomic(path, &bytes).map_err(Error::from)?;
         ui::say(&format!("wrote {} rows: {}", rows.len(), path.display()));
     }
-    if let Some(target) = &plot {
-        heatmap::draw(&rows, target)?;
-    }
-    match args.format {
-        Form::Table => print(&rows, &samples)?,
-        Form::Json => ui::print_bytes(&mi::to_json(&rows).map_err(anyhow::Error::msg)?)?,
-        Form::Csv => ui::print_bytes(&mi::to_csv(&rows).map_err(anyhow::Error::msg)?)?,
-        Form::Parquet => ui::print_bytes(&mi::to_parquet(&rows).map_err(anyhow::Error::msg)?)?,
-    }
+    let printed = match args.format {
+        Form::Table => print(&rows, &samples),
+        Form::Json => ui::print_bytes(&mi::to_json(&rows).map_err(anyhow::Error::msg)?),
+        Form::Csv => ui::print_bytes(&mi::to_csv(&rows).map_err(anyhow::Error::msg)?),
+        Form::Parquet => ui::print_bytes(&mi::to_parquet(&rows).map_err(anyhow::Error::msg)?),
+    };
+    // after the results, which a picture that cannot be drawn must not take away, and even if nobody reads them
+    plot.map_or(Ok(()), |target| heatmap::draw(&rows, &target))?;
+    printed?;
     for (job, error) in &failures {
         ui::say(&format!("warning: no {} for {}: {error}", job.estimator, place(&job.labels)));
     }
     let warned = rows.iter().filter(|r| r.warnings.iter().any(|w| !w.starts_with(mi::NOTE))).count() + failures.len();
     anyhow::ensure!(!args.strict || warned == 0, "{warned} results carry warnings, and --strict was given");
     Ok(Outcome::Done)
+}
+
+/// A heat map has one cell per pair: several lags would fall into one, and columns that are moved in time are other
+/// columns on one axis only.
+fn refuse_undrawable(args: &Args) -> Result<(), Error> {
+    let message = if !args.all_pairs && !args.x.is_empty() {
+        "--plot draws a matrix: give --all-pairs, or a store"
+    } else if args.lag.len() > 1 {
+        "--plot draws one lag: give --lag one number"
+    } else if args.all_pairs && args.lag.iter().any(|&lag| lag > 0) {
+        "--plot of --all-pairs is for columns at the same time: leave out --lag"
+    } else {
+        return Ok(());
+    };
+    Err(Error::Usage(message.to_owned()))
 }
 
 fn plan(args: &Args) -> Result<Plan, Error> {
@@ -250,11 +264,22 @@ fn writer(path: &Path, input: &Path, force: bool) -> anyhow::Result<Write> {
 
 fn samples(args: &Args) -> Result<Vec<Samples>, Error> {
     let sets = unlagged(args)?;
-    let mut out = Vec::new();
+    let (mut out, mut short) = (Vec::new(), Vec::new());
     for set in &sets {
         for &lag in args.lag.iter() {
-            out.push(pairs::lagged(set, lag)?);
+            match pairs::lagged(set, lag) {
+                Ok(samples) => out.push(samples),
+                Err(error) => short.push((place(&set.labels), error)),
+            }
         }
+    }
+    if out.is_empty()
+        && let Some((_, error)) = short.pop()
+    {
+        return Err(error.into());
+    }
+    for (place, error) in short {
+        ui::say(&format!("note: {place} left out: {error}"));
     }
     Ok(out)
 }
@@ -265,7 +290,11 @@ fn unlagged(args: &Args) -> Result<Vec<Samples>, Error> {
         let (x, y, given) = (args.x.clone(), args.y.clone(), args.given.clone());
         let options = TableOptions { x, y, given, group: args.group.clone(), time: args.time.clone() };
         if args.all_pairs {
-            return Ok(pairs::all_pairs(path, &options)?);
+            let (sets, left_out) = pairs::all_pairs(path, &options)?;
+            for what in left_out {
+                ui::say(&format!("note: left out: {what}"));
+            }
+            return Ok(sets);
         }
         if options.y.is_empty() {
             return Err(Error::Usage("--x needs --y, or --all-pairs".to_owned()));

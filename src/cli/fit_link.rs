@@ -6,13 +6,14 @@ use clap::ValueHint;
 use clap::builder::PossibleValuesParser;
 use serde_json::json;
 
-use super::Outcome;
+use super::args::end_on_signals;
 use super::ui::{self, Format};
+use super::{Outcome, outputs};
 use crate::Error;
 use crate::channel::{self, Compared, Estimate, Fit, FitOutcome, MODELS, Observations, Score};
 use crate::figure::{self, FIGURES};
-use crate::io::{self, IoError};
-use crate::link::{FITTED_KIND, FITTED_LIMIT};
+use crate::io;
+use crate::link::FITTED_KIND;
 use crate::registry::find;
 
 const EXAMPLES: &str = "\
@@ -21,7 +22,7 @@ Examples:
   ccmarl fit-link measured.csv --model markov --out wifi.json
   ccmarl train --scenario simple_spread --prior file:wifi.json --out runs/matched
 
-STORE is what `ccmarl record` wrote, or a CSV or Parquet table with the columns episode, step,
+STORE is what `ccmarl record` wrote, or a CSV, TSV or Parquet table with the columns episode, step,
 sender, receiver, delivered. Models are compared by their likelihood on 30 % of the episodes, which
 they were not fitted on: auto takes the simplest one that none beats by three standard errors, and
 fits it to all episodes (a classifier stays as it was scored). All intervals of a fit hold together
@@ -54,9 +55,10 @@ pub(super) struct Args {
 
 /// Runs the command.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
-    let figure = args.out.with_extension("reliability.svg");
-    refuse_foreign(&args.out, args.force).map_err(Error::from)?;
-    io::refuse_existing(&figure, args.force).map_err(Error::from)?;
+    end_on_signals()?;
+    let figure = figure_beside(&args.out);
+    outputs::check(&args.out, args.force, is_fitted)?;
+    outputs::check(&figure, args.force, outputs::is_picture)?;
     let observations = Observations::read(&args.store).map_err(Error::from)?;
     let bar = ui::progress(100, "fitting");
     let progress = |model: &'static str, share: f64| {
@@ -67,30 +69,29 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     bar.finish_and_clear();
     let svg = figure::svg(find("figure", FIGURES, "reliability").map_err(Error::from)?, &fit.reliability())?;
     io::write_atomic(&args.out, fit.to_json()?.as_bytes()).map_err(Error::from)?;
-    io::write_atomic(&figure, svg.as_bytes()).map_err(Error::from)?;
+    outputs::write_svg(&figure, svg)?;
+    let [out, figure] = [&args.out, &figure].map(|path| path.display().to_string()); // JSON is UTF-8, a path need not be
     match args.format {
-        Format::Json => ui::print_json(&json!({"out": args.out, "figure": figure, "link": fit.link, "fit": fit}))?,
+        Format::Json => ui::print_json(&json!({"out": out, "figure": figure, "link": fit.link, "fit": fit}))?,
         Format::Table => print(&fit)?,
     }
     fit.notes.iter().for_each(|note| ui::say(&format!("note: {note}")));
-    ui::say(&format!(
-        "wrote {} and {}; use it with --link file:{}",
-        args.out.display(),
-        figure.display(),
-        args.out.display()
-    ));
+    ui::say(&format!("wrote {out} and {figure}; use it with --link file:{out}"));
     Ok(Outcome::Done)
 }
 
-/// Refuses an output that exists, or with `force` one that is no fitted link.
-fn refuse_foreign(out: &Path, force: bool) -> Result<(), IoError> {
-    io::refuse_existing(out, force)?;
-    if out.symlink_metadata().is_err() {
-        return Ok(());
-    }
-    let text = io::read_text(out, FITTED_LIMIT).unwrap_or_default();
-    let json: serde_json::Value = serde_json::from_str(&text).unwrap_or_default();
-    if json["kind"] == FITTED_KIND { Ok(()) } else { Err(IoError::Foreign(out.to_owned())) }
+/// `FILE.reliability.svg`, without the `.json` of FILE.
+fn figure_beside(out: &Path) -> PathBuf {
+    let is_json = out.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("json"));
+    let mut name = if is_json { out.with_extension("") } else { out.to_owned() }.into_os_string();
+    name.push(".reliability.svg");
+    name.into()
+}
+
+/// Whether a file is a fitted link.
+fn is_fitted(bytes: &[u8]) -> bool {
+    let json: serde_json::Value = serde_json::from_slice(bytes).unwrap_or_default();
+    json["kind"] == FITTED_KIND
 }
 
 fn print(fit: &Fit) -> anyhow::Result<()> {
@@ -156,5 +157,22 @@ fn compared(model: &Compared, chosen: &str) -> Vec<String> {
             score.balanced_accuracy.map_or_else(|| "-".to_owned(), |e| format!("{:.4}", e.value)),
             format!("{:.4}", score.calibration_error.value),
         ],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_json_is_taken_off_the_name_of_the_figure() {
+        for (out, figure) in [
+            ("a/link.json", "a/link.reliability.svg"),
+            ("link.JSON", "link.reliability.svg"),
+            ("wifi.v1", "wifi.v1.reliability.svg"),
+            ("wifi", "wifi.reliability.svg"),
+        ] {
+            assert_eq!(figure_beside(Path::new(out)), Path::new(figure));
+        }
     }
 }

@@ -2,9 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
+use super::{outputs, ui};
 use crate::Error;
 use crate::figure::{self, Cell, Data, FIGURES};
-use crate::io;
+use crate::io::read_bytes;
 use crate::mi::Estimate;
 use crate::registry::find;
 
@@ -16,19 +17,20 @@ pub(super) struct Target {
 
 /// Checks the name before anything is computed.
 pub(super) fn target(path: &Path, force: bool) -> Result<Target, Error> {
-    io::refuse_existing(path, force)?;
     let ends = |with: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(with));
     if !ends("svg") && !ends("png") {
         let message = format!("--plot: expected a name that ends in .svg or .png, found {}", path.display());
         return Err(Error::Usage(message));
     }
+    outputs::check(path, force, outputs::is_picture)?;
     Ok(Target { path: path.to_owned(), is_png: ends("png") })
 }
 
-/// Draws the rows of the first estimator that has a finite value.
+/// Draws the rows of the first estimator that has a finite value; where none has, it says so.
 pub(super) fn draw(rows: &[Estimate], target: &Target) -> anyhow::Result<()> {
     let Some(first) = rows.iter().find(|r| r.value.is_finite()) else {
-        anyhow::bail!("no finite value to draw: {}", target.path.display());
+        ui::say(&format!("note: no finite value to draw: {}", target.path.display()));
+        return Ok(());
     };
     let of_links = first.sender.is_some();
     let chosen = rows.iter().filter(|r| r.estimator == first.estimator);
@@ -69,15 +71,14 @@ pub(super) fn draw(rows: &[Estimate], target: &Target) -> anyhow::Result<()> {
     };
     let entry = find("figure", FIGURES, "mi-heatmap")?;
     if target.is_png {
-        let folder =
-            tempfile::tempdir_in(target.path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")))?;
+        let folder = tempfile::tempdir()?;
         let whole = folder.path().join("figure.png");
         figure::png(entry, &data, &whole)?;
-        std::fs::rename(whole, &target.path)?;
+        outputs::write_png(&target.path, &read_bytes(&whole, u64::MAX - 1).map_err(Error::from)?)?;
     } else {
-        io::write_atomic(&target.path, figure::svg(entry, &data)?.as_bytes()).map_err(Error::from)?;
+        outputs::write_svg(&target.path, figure::svg(entry, &data)?)?;
     }
-    super::ui::say(&format!(
+    ui::say(&format!(
         "drew {} values of {}: {}",
         rows.iter().filter(|r| r.estimator == first.estimator).count(),
         first.estimator,

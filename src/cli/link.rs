@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use rayon::iter::{IntoParallelIterator as _, ParallelIterator as _};
 use serde_json::json;
 
-use super::Outcome;
-use super::args::ScenarioArgs;
+use super::args::{ScenarioArgs, end_on_signals};
 use super::ui::{self, Format};
+use super::{Outcome, outputs};
 use crate::channel::{BIN_WIDTH, LinkStatistics, Observed};
 use crate::figure::{self, FIGURES};
 use crate::link::LINKS;
@@ -81,10 +81,12 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
 }
 
 fn simulate(args: &SimulateArgs) -> anyhow::Result<Outcome> {
+    end_on_signals()?;
     if let Some(out) = &args.out {
-        for name in PICTURES.iter().map(|(name, ..)| *name).chain([TABLE]) {
-            io::refuse_existing(&out.join(name), args.force).map_err(Error::from)?;
+        for (name, ..) in PICTURES {
+            outputs::check(&out.join(name), args.force, outputs::is_picture)?;
         }
+        outputs::check(&out.join(TABLE), args.force, LinkStatistics::is_csv)?;
     }
     let spec = args.scenario.spec(Some(Spec::new("simple_spread")))?.unwrap_or_else(|| Spec::new("simple_spread"));
     let scenario = scenario::build(&spec).map_err(Error::from)?;
@@ -107,9 +109,7 @@ fn simulate(args: &SimulateArgs) -> anyhow::Result<Outcome> {
     let counted = (0..args.episodes).into_par_iter().fold(empty, count).reduce(empty, |a, b| a.merge(&b));
     bar.finish_and_clear();
     let title = format!("{link_spec} on {}, {} episodes", spec.name, args.episodes);
-    if let Some(out) = &args.out {
-        write(&counted, &title, out)?;
-    }
+    let drawn = args.out.as_ref().map(|out| write(&counted, &title, out)).transpose()?.unwrap_or(0);
     match args.format {
         Format::Json => ui::print_json(&json!({
             "link": link.parameters(), "scenario": scenario.parameters(), "policy": policy.parameters(),
@@ -118,25 +118,33 @@ fn simulate(args: &SimulateArgs) -> anyhow::Result<Outcome> {
         Format::Table => print(&counted)?,
     }
     match &args.out {
-        Some(out) => ui::say(&format!("wrote {TABLE} and {} figures: {}", PICTURES.len(), out.display())),
+        Some(out) => ui::say(&format!("wrote {TABLE} and {drawn} figures: {}", out.display())),
         None => ui::say("figures: give --out DIR"),
     }
     Ok(Outcome::Done)
 }
 
-fn write(counted: &LinkStatistics, title: &str, out: &Path) -> anyhow::Result<()> {
+/// Writes the table and the figures; how many these are. A figure of an earlier run that has nothing to show now goes.
+fn write(counted: &LinkStatistics, title: &str, out: &Path) -> anyhow::Result<usize> {
+    let mut count = 0;
     for (name, figure, unit) in PICTURES {
         let data = counted.figures(title, unit);
         let drawn = figure::svg(find("figure", FIGURES, figure).map_err(Error::from)?, &data);
         match drawn {
-            Ok(svg) => io::write_atomic(&out.join(name), svg.as_bytes()).map_err(Error::from)?,
+            Ok(svg) => {
+                outputs::write_svg(&out.join(name), svg)?;
+                count += 1;
+            }
             // a link that never loses has no bursts to draw
-            Err(figure::FigureError::Empty { needs, .. }) => ui::say(&format!("note: no {name}: there is no {needs}")),
+            Err(figure::FigureError::Empty { needs, .. }) => {
+                io::remove(&out.join(name)).map_err(Error::from)?;
+                ui::say(&format!("note: no {name}: there is no {needs}"));
+            }
             Err(error) => return Err(error.into()),
         }
     }
     io::write_atomic(&out.join(TABLE), counted.csv().as_bytes()).map_err(Error::from)?;
-    Ok(())
+    Ok(count)
 }
 
 fn print(counted: &LinkStatistics) -> anyhow::Result<()> {

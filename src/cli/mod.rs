@@ -12,6 +12,7 @@ mod heatmap;
 mod inspect;
 mod link;
 mod list;
+mod outputs;
 mod pairs;
 mod quickstart;
 mod record;

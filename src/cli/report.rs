@@ -47,6 +47,7 @@ pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
 /// Writes the report and prints the summary, but not where it lies.
 pub(super) fn make(args: &ReportArgs) -> anyhow::Result<Summary> {
     crate::io::refuse_existing(&args.out, args.force).map_err(crate::Error::from)?;
+    crate::storage::refuse_within_store(&args.out).map_err(crate::Error::from)?;
     let collected = collect(&args.runs, &args.mi).map_err(crate::Error::from)?;
     let command = command_line(std::env::args_os().map(|a| a.to_string_lossy().into_owned()));
     let references = references(&collected);

@@ -151,6 +151,7 @@ fn refuse_overlap(out: &Path, record: &Path) -> anyhow::Result<()> {
 
 /// Runs the command.
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    crate::storage::refuse_within_store(&args.out).map_err(Error::from)?;
     if let Some(record) = &args.record {
         refuse_overlap(&args.out, record)?;
     }

@@ -79,7 +79,11 @@ fn build(spec: &Spec, setting: &Setting) -> Result<Box<dyn Link>, RegistryError>
     let given: Params = spec.params()?;
     let (sha256, inner) = match (given.link, given.sha256) {
         (Some(link), Some(sha256)) => (sha256, link),
-        (link, sha256) => {
+        (Some(_), None) => {
+            return Err(spec
+                .invalid("link stands without the sha256 of the file that it is from: give both, or the path alone"));
+        }
+        (None, sha256) => {
             let (found, document) = read(&given.path)?;
             if let Some(expected) = sha256.filter(|expected| *expected != found) {
                 return Err(refused(
@@ -87,7 +91,7 @@ fn build(spec: &Spec, setting: &Setting) -> Result<Box<dyn Link>, RegistryError>
                     &given.path,
                 ));
             }
-            (found, link.unwrap_or(document.link))
+            (found, document.link)
         }
     };
     let link = super::build_inner(spec, &inner, setting).map_err(|error| match error {
@@ -158,6 +162,20 @@ mod tests {
         let again: Spec = serde_json::from_value(Value::Object(link.parameters())).unwrap();
         assert_eq!(build(&again, &setting).unwrap().parameters(), link.parameters(), "the file is gone");
         assert!(build(&spec, &setting).err().unwrap().to_string().starts_with("no such file or directory"));
+    }
+
+    #[test]
+    fn a_digest_vouches_for_the_link_beside_it() {
+        let (_dir, spec) = file(r#"{"kind":"ccmarl link","link":{"name":"dropout","p":0.5}}"#);
+        let setting = test_setting(0.25);
+        let other = spec.clone().with("link", serde_json::json!({"name": "perfect"}));
+        let error = build(&other, &setting).err().unwrap().to_string();
+        assert!(error.starts_with("file: link stands without the sha256 of the file that it is from"), "{error}");
+        let sha256 = build(&spec, &setting).unwrap().parameters()["sha256"].clone();
+        let vouched = build(&spec.clone().with("sha256", sha256), &setting).unwrap();
+        assert_eq!(vouched.parameters()["link"]["name"], "dropout");
+        let changed = build(&spec.with("sha256", "0".repeat(64)), &setting).err().unwrap().to_string();
+        assert!(changed.contains("the file was changed"), "{changed}");
     }
 
     #[test]

@@ -38,12 +38,29 @@ pub(super) const ENTRY: Entry<Build> = Entry {
 
 const MAX_LINKS: usize = 64;
 
-/// Links as a list of tables, or as text.
+/// Links as a list, or as text.
 #[derive(Deserialize)]
-#[serde(untagged)]
+#[serde(untagged, expecting = "a list of links, or text: perfect,dropout:0.5")]
 enum Named {
     Text(String),
-    List(Vec<Spec>),
+    List(Vec<One>),
+}
+
+/// A link in a list: as on the command line, or a table.
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum One {
+    Text(String),
+    Table(Spec),
+}
+
+impl One {
+    fn spec(self) -> Result<Spec, RegistryError> {
+        match self {
+            Self::Text(text) => Spec::parse("link", LINKS, text.trim()),
+            Self::Table(spec) => Ok(spec),
+        }
+    }
 }
 
 #[derive(Deserialize)]
@@ -68,12 +85,11 @@ struct Mixture {
 
 fn build(spec: &Spec, setting: &Setting) -> Result<Box<dyn Link>, RegistryError> {
     let Params { links, weights } = spec.params()?;
-    let specs = match links {
+    let named = match links {
         Named::List(list) => list,
-        Named::Text(text) => {
-            text.split(',').map(|link| Spec::parse("link", LINKS, link.trim())).collect::<Result<_, _>>()?
-        }
+        Named::Text(text) => text.split(',').map(|link| One::Text(link.to_owned())).collect(),
     };
+    let specs = named.into_iter().map(One::spec).collect::<Result<Vec<_>, _>>()?;
     if !(1..=MAX_LINKS).contains(&specs.len()) {
         return Err(spec.invalid(format!("expected 1 to {MAX_LINKS} links, found {}", specs.len())));
     }
@@ -152,6 +168,16 @@ mod tests {
         let expected =
             r#"{"name":"mixture","links":[{"name":"perfect"},{"name":"dropout","p":0.5}],"weights":[1.0,1.0]}"#;
         assert_eq!(json, expected);
+    }
+
+    #[test]
+    fn a_list_of_texts_is_read_as_the_command_line_is() {
+        let built = |json: &str| build(&spec(json), &test_setting(0.25)).map(|link| link.parameters());
+        let listed = built(r#"{"name":"mixture","links":["distance:3","dropout:0.3"]}"#).unwrap();
+        assert_eq!(listed, built(r#"{"name":"mixture","links":"distance:3,dropout:0.3"}"#).unwrap());
+        assert_eq!(listed["links"][1]["p"], 0.3);
+        let error = built(r#"{"name":"mixture","links":7}"#).unwrap_err().to_string();
+        assert!(error.contains("a list of links, or text: perfect,dropout:0.5"), "{error}");
     }
 
     #[test]

@@ -9,7 +9,7 @@
 //! row after the last action then repeats the one before.
 //!
 //! # Parameters
-//! `path` of a rollout store, or of a CSV or Parquet table with the columns episode, step, sender, receiver, delivered
+//! `path` of a rollout store, or of a CSV, TSV or Parquet table with the columns episode, step, sender, receiver, delivered
 //! (`trace:data/tag`); episodes and steps count from 0 without gaps, every ordered pair of agents has a row in each.
 //! `sha256`: the trace's own digest (of a store: its content), which must match when given. `cycle` starts again after
 //! the last episode; without it, playing more episodes than the trace has is refused.

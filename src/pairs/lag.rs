@@ -9,7 +9,7 @@ use crate::schema::{Columns, Exchange, Samples};
 /// One series is one episode here, whatever blocks it is cut into.
 ///
 /// # Errors
-/// [`PairsError::NoLag`] when no episode is long enough.
+/// [`PairsError::NoLag`] when no sample has so many rows after it in its episode.
 pub fn lagged(samples: &Samples, lag: usize) -> Result<Samples, PairsError> {
     if lag == 0 {
         return Ok(samples.clone());
@@ -24,7 +24,10 @@ pub fn lagged(samples: &Samples, lag: usize) -> Result<Samples, PairsError> {
     if rows.is_empty() {
         let longest = samples.starts.windows(2).map(|w| w[1] - w[0]).max().unwrap_or(0);
         let longest = if samples.exchange == Exchange::Shift { count } else { longest };
-        return Err(PairsError::NoLag { lag, longest });
+        // a store says itself what its episodes are
+        let of_store = samples.labels.sender.is_some();
+        let remedy = if of_store { "give a smaller --lag" } else { "give --time or --group, or a smaller --lag" };
+        return Err(PairsError::NoLag { lag, longest, samples: samples.rows.len(), remedy });
     }
     // the last rows have no y of their own later on: they are no samples, and what stands there is never read
     let mut data = Vec::with_capacity(count * width);
@@ -69,7 +72,17 @@ mod tests {
         let error = lagged(&samples(Exchange::Episodes), 5).unwrap_err().to_string();
         assert_eq!(
             error,
-            "no pair 5 rows apart: the longest episode has 5 rows; give --time or --group, or a smaller --lag"
+            "no pair 5 rows apart: the longest episode has 5 rows, and none of the 6 samples has so many after it; give --time or --group, or a smaller --lag"
+        );
+    }
+
+    #[test]
+    fn of_a_rare_class_too_few_samples_are_the_reason() {
+        let labels = SampleLabels { sender: Some("a".to_owned()), ..SampleLabels::default() };
+        let rare = Samples { rows: vec![3, 8], labels, ..samples(Exchange::Episodes) };
+        assert_eq!(
+            lagged(&rare, 1).unwrap_err().to_string(),
+            "no pair 1 rows apart: the longest episode has 5 rows, and none of the 2 samples has so many after it; give a smaller --lag"
         );
     }
 

@@ -56,13 +56,17 @@ pub enum PairsError {
     NoColumns(PathBuf),
     /// No episode is long enough for a lag.
     #[error(
-        "no pair {lag} rows apart: the longest episode has {longest} rows; give --time or --group, or a smaller --lag"
+        "no pair {lag} rows apart: the longest episode has {longest} rows, and none of the {samples} samples has so many after it; {remedy}"
     )]
     NoLag {
         /// Rows between x and y.
         lag: usize,
         /// Rows of the longest episode.
         longest: usize,
+        /// Samples without a lag.
+        samples: usize,
+        /// What to do.
+        remedy: &'static str,
     },
     /// A pattern that is none, or that no column matches.
     #[error("{pattern:?}: {message}: {}", path.display())]

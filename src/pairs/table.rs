@@ -1,7 +1,6 @@
 //! Samples from named columns of a CSV, TSV or Parquet file.
 
 use std::fs::File;
-use std::io::Read as _;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -68,12 +67,13 @@ pub fn table(path: &Path, options: &TableOptions) -> Result<Samples, PairsError>
     })
 }
 
-/// One set of samples per unordered pair of the columns `options.x`, or of all columns of numbers or words. The file is
-/// read once; rows with a missing value are left out pair by pair.
+/// One set of samples per unordered pair of the columns `options.x`, or of all columns of numbers or words; and what was
+/// left out: empty columns, and pairs without a common row. The file is read once; rows with a missing value are left out
+/// pair by pair.
 ///
 /// # Errors
-/// As [`table()`]; [`PairsError::NoPairs`].
-pub fn all_pairs(path: &Path, options: &TableOptions) -> Result<Vec<Samples>, PairsError> {
+/// As [`table()`]; [`PairsError::NoPairs`]; [`PairsError::NoRows`] when no pair is left.
+pub fn all_pairs(path: &Path, options: &TableOptions) -> Result<(Vec<Samples>, Vec<String>), PairsError> {
     if !path.exists() {
         return Err(IoError::Missing(path.to_owned()).into());
     }
@@ -94,12 +94,26 @@ pub fn all_pairs(path: &Path, options: &TableOptions) -> Result<Vec<Samples>, Pa
         if columns.len() < 2 {
             return Err(PairsError::NoPairs { found: columns.len(), path: path.to_owned() });
         }
-        let pairs = (0..columns.len()).flat_map(|i| (i + 1..columns.len()).map(move |j| (i, j)));
-        let one = |(i, j): (usize, usize)| {
-            let (x, y) = (vec![columns[i].clone()], vec![columns[j].clone()]);
-            samples(&frame, path, &TableOptions { x, y, ..options.clone() })
-        };
-        pairs.map(one).collect()
+        let is_empty = |name: &String| frame.column(name).is_ok_and(|c| c.null_count() == frame.height());
+        let (empty, full): (Vec<String>, Vec<String>) = columns.into_iter().partition(is_empty);
+        let (mut sets, mut last) = (Vec::new(), None);
+        let mut left_out: Vec<String> = empty.iter().map(|name| format!("column {name:?} is empty")).collect();
+        for (i, j) in (0..full.len()).flat_map(|i| (i + 1..full.len()).map(move |j| (i, j))) {
+            let (x, y) = (vec![full[i].clone()], vec![full[j].clone()]);
+            match samples(&frame, path, &TableOptions { x, y, ..options.clone() }) {
+                Ok(set) => sets.push(set),
+                Err(error @ PairsError::NoRows { .. }) => {
+                    left_out.push(error.to_string());
+                    last = Some(error);
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        if !sets.is_empty() {
+            return Ok((sets, left_out));
+        }
+        let columns = full.into_iter().chain(empty).collect::<Vec<_>>().join(", ");
+        Err(last.unwrap_or_else(|| PairsError::NoRows { rows: frame.height(), columns, path: path.to_owned() }))
     })
 }
 
@@ -216,24 +230,9 @@ fn episodes(rows: &mut [usize], group: Option<&[Option<String>]>, options: &Tabl
     (starts, options.group.clone().unwrap_or_default())
 }
 
-/// `Parquet`, `TSV` or `CSV`, by the first bytes, else by the extension.
-fn form(path: &Path) -> Result<&'static str, IoError> {
-    let mut magic = [0; 4];
-    let file = File::open(path).map_err(IoError::os("open", path))?;
-    let read = file.take(4).read(&mut magic).map_err(IoError::os("read", path))?;
-    let named = |extension: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(extension));
-    Ok(if named("parquet") || magic[..read] == *b"PAR1" {
-        "Parquet"
-    } else if named("tsv") || named("tab") {
-        "TSV"
-    } else {
-        "CSV"
-    })
-}
-
 /// Runs what touches a foreign file's data; a panic in there becomes an error of ours.
 fn caught<T>(path: &Path, read: impl FnOnce(&'static str) -> Result<T, PairsError>) -> Result<T, PairsError> {
-    let form = form(path)?;
+    let form = crate::storage::table_form(path)?;
     crate::io::caught(|| read(form)).unwrap_or_else(|| {
         Err(PairsError::Unreadable { form, message: "the file is damaged".to_owned(), path: path.to_owned() })
     })

@@ -15,10 +15,13 @@ use crate::storage::{self, EpisodeSource};
 /// Columns of a table of link bits.
 const COLUMNS: [&str; 5] = ["episode", "step", "sender", "receiver", "delivered"];
 
+/// The form whose columns have types.
+const PARQUET: &str = "Parquet";
+
 /// Most agents in a table: there are as many links as their square.
 const MAX_AGENTS: u32 = 4096;
 
-/// Reads the link bits of a rollout store, or of a CSV or Parquet table with the columns `episode`, `step`, `sender`,
+/// Reads the link bits of a rollout store, or of a CSV, TSV or Parquet table with the columns `episode`, `step`, `sender`,
 /// `receiver` and `delivered` (true, false, 1 or 0). Episodes and steps count from 0 without gaps; every ordered pair of
 /// the agents has one row in each; rows may stand in any order. Agents stand in the order of a store, or sorted (by
 /// number, where all are numbers).
@@ -29,12 +32,12 @@ pub fn read_trace(path: &Path) -> Result<Trace, RegistryError> {
     if !is_link_table(path)? {
         return from_source(storage::open(path).map_err(|e| data(&e))?.as_mut());
     }
-    let parquet = ends(path, "parquet");
-    if parquet {
+    let form = form(path)?;
+    if form == PARQUET {
         storage::check_table(path).map_err(|e| data(&e))?;
     }
     let (sha256, _) = crate::io::sha256_file(path).map_err(|e| data(&e))?;
-    let table = Table::read(path, parquet)?;
+    let table = Table::read(path, form)?;
     table.into_trace(sha256).map_err(|message| refused(&message, path))
 }
 
@@ -47,7 +50,20 @@ pub fn is_link_table(path: &Path) -> Result<bool, RegistryError> {
     if !path.exists() || path.is_dir() || ends(path, "mcap") {
         return Ok(false);
     }
-    Ok(!ends(path, "parquet") || names(path, true)?.iter().any(|name| name == "delivered"))
+    let form = form(path)?;
+    Ok(form != PARQUET || names(path, form)?.iter().any(|name| name == "delivered"))
+}
+
+/// `CSV`, `TSV` or [`PARQUET`].
+fn form(path: &Path) -> Result<&'static str, RegistryError> {
+    storage::table_form(path).map_err(|e| data(&e))
+}
+
+/// How text of this form is read: every cell as text, so that what is wrong with it can be said.
+fn text_options(form: &str) -> CsvReadOptions {
+    let separator = if form == "TSV" { b'\t' } else { b',' };
+    let options = CsvReadOptions::default().with_infer_schema_length(Some(0));
+    options.map_parse_options(|options| options.with_separator(separator))
 }
 
 fn ends(path: &Path, extension: &str) -> bool {
@@ -80,8 +96,7 @@ fn from_source(source: &mut dyn EpisodeSource) -> Result<Trace, RegistryError> {
 }
 
 /// Runs what touches a foreign file; a panic in there, and what polars says, become errors of ours.
-fn caught<T>(path: &Path, parquet: bool, read: impl FnOnce() -> PolarsResult<T>) -> Result<T, RegistryError> {
-    let form = if parquet { "Parquet" } else { "CSV" };
+fn caught<T>(path: &Path, form: &str, read: impl FnOnce() -> PolarsResult<T>) -> Result<T, RegistryError> {
     let fail = |message: &str| refused(&format!("not a readable {form} table: {message}"), path);
     match crate::io::caught(read) {
         Some(Ok(value)) => Ok(value),
@@ -91,14 +106,13 @@ fn caught<T>(path: &Path, parquet: bool, read: impl FnOnce() -> PolarsResult<T>)
 }
 
 /// The names of a file's columns.
-fn names(path: &Path, parquet: bool) -> Result<Vec<String>, RegistryError> {
+fn names(path: &Path, form: &str) -> Result<Vec<String>, RegistryError> {
     let file = File::open(path).map_err(IoError::os("open", path)).map_err(|e| data(&e))?;
-    caught(path, parquet, || {
-        if parquet {
+    caught(path, form, || {
+        if form == PARQUET {
             return Ok(ParquetReader::new(file).schema()?.iter_names().map(ToString::to_string).collect());
         }
-        let options = CsvReadOptions::default().with_n_rows(Some(0)).with_infer_schema_length(Some(0));
-        let frame = options.into_reader_with_file_handle(file).finish()?;
+        let frame = text_options(form).with_n_rows(Some(0)).into_reader_with_file_handle(file).finish()?;
         Ok(frame.get_column_names().into_iter().map(ToString::to_string).collect())
     })
 }
@@ -115,25 +129,23 @@ struct Table {
 }
 
 impl Table {
-    fn read(path: &Path, parquet: bool) -> Result<Self, RegistryError> {
-        let found = names(path, parquet)?;
+    fn read(path: &Path, form: &str) -> Result<Self, RegistryError> {
+        let found = names(path, form)?;
         if let Some(missing) = COLUMNS.iter().find(|&&c| !found.iter().any(|f| f == c)) {
             let hint = did_you_mean(missing, found.iter().map(String::as_str));
             return Err(refused(&format!("no column {missing:?} (needed are {}): {hint}", COLUMNS.join(", ")), path));
         }
         let file = File::open(path).map_err(IoError::os("open", path)).map_err(|e| data(&e))?;
-        let frame: DataFrame = caught(path, parquet, || {
-            if parquet {
+        let frame: DataFrame = caught(path, form, || {
+            if form == PARQUET {
                 let wanted = COLUMNS.map(ToOwned::to_owned).to_vec();
                 return ParquetReader::new(file).with_columns(Some(wanted)).finish();
             }
             let columns = COLUMNS.map(Into::into).into();
-            // every cell is read as text, so that what is wrong with it can be said
-            let options = CsvReadOptions::default().with_infer_schema_length(Some(0)).with_columns(Some(columns));
-            options.into_reader_with_file_handle(file).finish()
+            text_options(form).with_columns(Some(columns)).into_reader_with_file_handle(file).finish()
         })?;
         let column =
-            |name: &'static str| -> Result<&Column, RegistryError> { caught(path, parquet, || frame.column(name)) };
+            |name: &'static str| -> Result<&Column, RegistryError> { caught(path, form, || frame.column(name)) };
         let whole = |name: &'static str| -> Result<Vec<u64>, RegistryError> {
             each(column(name)?, path, |text| text.parse().map_err(|_e| "a whole number from 0"))
         };
@@ -258,6 +270,25 @@ mod tests {
         assert_eq!(trace.sha256.len(), 64);
         let more = "delivered,x,receiver,sender,step,episode\n1,7,10,9,0,0\n0,7,9,10,0,0\n";
         assert_eq!(read(more).unwrap().agents, ["9", "10"], "numbers sort as numbers, columns stand anywhere");
+    }
+
+    #[test]
+    fn tsv_is_read_and_parquet_is_known_by_its_first_bytes() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = |name: &str| dir.path().join(name);
+        let text = format!("{HEAD}0,0,a,b,1\n0,0,b,a,0\n").replace(',', "\t");
+        for name in ["t.tsv", "t.TAB"] {
+            crate::io::write_atomic(&path(name), text.as_bytes()).unwrap();
+            assert_eq!(read_trace(&path(name)).unwrap().bits, [true, false]);
+        }
+        let mut frame = polars::prelude::df!("episode" => [0, 0], "step" => [0, 0], "sender" => ["a", "b"],
+            "receiver" => ["b", "a"], "delivered" => [true, false])
+        .unwrap();
+        let mut bytes = Vec::new();
+        polars::prelude::ParquetWriter::new(&mut bytes).finish(&mut frame).unwrap();
+        crate::io::write_atomic(&path("bits.data"), &bytes).unwrap();
+        assert!(is_link_table(&path("bits.data")).unwrap());
+        assert_eq!(read_trace(&path("bits.data")).unwrap().bits, [true, false]);
     }
 
     #[test]

@@ -3,6 +3,7 @@
 //! Adding a format: write `storage/<name>.rs` with an `ENTRY`, and add `mod <name>;` and `<name>::ENTRY,` below.
 
 mod convert;
+mod form;
 mod lock;
 mod mcap;
 mod names;
@@ -25,6 +26,7 @@ use tally::Tally;
 use verify::Findings;
 
 pub use convert::convert;
+pub use form::table_form;
 pub use lock::Owner;
 pub use names::refuse_within_store;
 pub use recover::{Recovered, recover};

@@ -13,7 +13,7 @@ use crate::schema::{Episode, Manifest};
 pub struct Rescued {
     /// Episodes in the new store; 0 when none was sound, and none was written.
     pub episodes: u64,
-    /// Episodes that the damaged store was to hold.
+    /// Episodes that the damaged store held when it was sealed, else those that it was to hold.
     pub planned: u64,
     /// The numbers that were saved, as ranges \[from, to), as they were in the damaged store.
     pub kept: Vec<[u64; 2]>,
@@ -66,7 +66,7 @@ pub fn rescue(
     };
     let mut findings = Findings::new(&mut note);
     diagnose(path, &mut findings)?;
-    let Some(manifest) = findings.trusted().map(Manifest::unsealed) else {
+    let Some(manifest) = findings.trusted().map(held) else {
         let message = "no manifest in it can be trusted, so that nothing says what its episodes are".to_owned();
         return Err(StorageError::Damaged { message, path: path.to_owned() });
     };
@@ -91,6 +91,13 @@ pub fn rescue(
             Err(StorageError::Damaged { message, path: path.to_owned() })
         }
     }
+}
+
+/// An unsealed manifest that plans what the damaged store held: a recording that was stopped in good order holds fewer
+/// episodes than were planned, and the others never were.
+fn held(manifest: &Manifest) -> Manifest {
+    let planned = if manifest.episodes > 0 { manifest.episodes } else { manifest.planned };
+    Manifest { planned, ..manifest.unsealed() }
 }
 
 /// Appends every sound episode, with the next number; how many these were.

@@ -188,6 +188,74 @@ fn lags_patterns_and_all_pairs_of_any_separator() {
 }
 
 #[test]
+fn a_lag_that_a_rare_class_cannot_have_leaves_only_that_class_out() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = dir.path().join("store").to_string_lossy().into_owned();
+    let record = ["record", "--scenario", "simple_spread", "--link", "dropout:0.005", "--episodes", "12"];
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ccmarl"));
+    assert!(command.args(record).args(["--out", &store]).output().unwrap().status.success());
+    let args = [store.as_str(), "--estimator", "gaussian", "--permutations", "0", "--format", "json"];
+    let (code, out, err) = run(&[&args[..], &["--lag", "22"]].concat());
+    assert_eq!(code, 0, "{err}");
+    assert!(out.contains("[+22]") && err.contains(" lost left out: no pair 22 rows apart: "), "{err}");
+    assert!(err.contains(" samples has so many after it; give a smaller --lag"), "{err}");
+    let (code, out, err) = run(&[&args[..], &["--lag", "25"]].concat());
+    assert!(code == 1 && out.is_empty() && err.contains("no pair 25 rows apart: the longest episode has 2"), "{err}");
+    assert!(!err.contains("--time"), "{err}");
+}
+
+#[test]
+fn all_pairs_leaves_out_what_is_empty_and_fails_only_when_nothing_is_left() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut text = "a,b,c,d,none\n".to_owned();
+    for i in 0..60 {
+        let (c, d) =
+            if i % 2 == 0 { ((i % 9).to_string(), String::new()) } else { (String::new(), (i % 8).to_string()) };
+        writeln!(text, "{i},{},{c},{d},", i * i % 11).unwrap();
+    }
+    let table = write(dir.path(), "gaps.csv", &text);
+    let args = [table.as_str(), "--all-pairs", "--estimator", "gaussian", "--permutations", "0", "--format", "csv"];
+    let (code, out, err) = run(&args);
+    assert_eq!((code, out.lines().count()), (0, 1 + 5), "{err}");
+    assert!(err.contains("note: left out: column \"none\" is empty"), "{err}");
+    assert!(err.contains("note: left out: no rows: all 60 rows have a missing value in c, d: "), "{err}");
+    let (code, out, err) = run(&[&args[..], &["--x", "c,d"]].concat());
+    assert!(code == 1 && out.is_empty() && err.contains("no rows: all 60 rows have a missing value in c, d"), "{err}");
+    let (code, _, err) = run(&[&args[..], &["--x", "a,none"]].concat());
+    assert!(code == 1 && err.contains("no rows: all 60 rows have a missing value in a, none"), "{err}");
+}
+
+#[test]
+fn a_picture_never_takes_the_results_away() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut text = "a,b\n".to_owned();
+    (0..60).for_each(|i| writeln!(text, "{i},{i}").unwrap());
+    let table = write(dir.path(), "copy.csv", &text);
+    let at = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let args = [table.as_str(), "--all-pairs", "--estimator", "gaussian", "--permutations", "0"];
+    // a copy has infinite information, which has no colour
+    let (code, out, err) = run(&[&args[..], &["--plot", &at("copy.svg")]].concat());
+    assert!(code == 0 && out.contains("infinite (copy)"), "{code}: {out}{err}");
+    assert!(err.contains("note: no finite value to draw: ") && !dir.path().join("copy.svg").exists(), "{err}");
+    let other = csv(dir.path());
+    let args = [other.as_str(), "--all-pairs", "--x", "a,b", "--estimator", "gaussian", "--permutations", "0"];
+    for name in ["new/deep/pairs.png", "newer/pairs.svg"] {
+        let (code, _, err) = run(&[&args[..], &["--plot", &at(name)]].concat());
+        assert!(code == 0 && dir.path().join(name).exists(), "{err}");
+    }
+    let (code, out, err) = run(&[&args[..], &["--plot", &format!("{other}/pairs.png")]].concat());
+    assert!(code == 1 && out.contains("a ; b") && err.contains("could not create the directory"), "{code}: {out}{err}");
+    // one cell would stand for several lags
+    for (more, message) in [
+        (&["--lag", "0,1", "--time", "t"][..], "--plot draws one lag"),
+        (&["--lag", "1", "--time", "t"], "--plot of --all-pairs is for columns at the same time"),
+    ] {
+        let (code, out, err) = run(&[&args[..], more, &["--plot", &at("lags.svg")]].concat());
+        assert!(code == 2 && out.is_empty() && err.contains(message), "{code}: {err}");
+    }
+}
+
+#[test]
 fn missing_values_are_counted_copies_are_infinite_and_strict_fails_on_warnings() {
     let dir = tempfile::tempdir().unwrap();
     let mut text = "a,b,d\n,1,1\n2,NaN,3\n".to_owned();

@@ -150,3 +150,82 @@ fn a_trace_is_replayed_in_training_and_in_evaluation_and_refused_when_it_ends_to
     std::fs::remove_file(dir.join("link.json")).unwrap();
     done(dir, "evaluate fitted --episodes 2");
 }
+
+#[test]
+fn a_path_that_is_not_utf_8_is_fitted_and_shown() {
+    use std::os::unix::ffi::OsStrExt as _;
+    let dir = tempfile::tempdir().unwrap();
+    record(dir.path(), "dropout:0.3", 20, "store");
+    let name = |bytes: &'static [u8]| std::ffi::OsStr::from_bytes(bytes);
+    std::fs::rename(dir.path().join("store"), dir.path().join(name(b"st\xffre"))).unwrap();
+    let output = Command::new(env!("CARGO_BIN_EXE_ccmarl"))
+        .current_dir(dir.path())
+        .arg("fit-link")
+        .args([name(b"st\xffre"), "--out".as_ref(), name(b"l\xffnk.json"), "--format".as_ref(), "json".as_ref()])
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    let json: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!((&json["out"], &json["fit"]["data"]["path"]), (&"l\u{fffd}nk.json".into(), &"st\u{fffd}re".into()));
+    assert!(dir.path().join(name(b"l\xffnk.reliability.svg")).exists());
+}
+
+#[test]
+fn files_beside_results_replace_only_their_own_and_lie_in_no_store() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    record(dir, "dropout:0.3", 20, "store");
+    let foreign = "refusing to replace what ccmarl did not make";
+    for (words, file) in [
+        ("fit-link store --out link.json --force", "link.reliability.svg"),
+        ("link simulate perfect --episodes 3 --out drawn --force", "drawn/statistics.csv"),
+        ("link simulate perfect --episodes 3 --out drawn --force", "drawn/burst-lengths.svg"),
+        ("estimate-mi store --estimator gaussian --permutations 0 --plot mi.svg --force", "mi.svg"),
+        ("estimate-mi store --estimator gaussian --permutations 0 --plot mi.png --force", "mi.png"),
+    ] {
+        write_atomic(&dir.join(file), b"<svg>mine</svg>").unwrap();
+        let (code, _, err) = run(dir, words);
+        assert!(code == 1 && err.contains(foreign) && err.contains(file), "{words}: {code}: {err}");
+        assert_eq!(std::fs::read(dir.join(file)).unwrap(), b"<svg>mine</svg>", "{words}");
+        std::fs::remove_file(dir.join(file)).unwrap();
+        done(dir, words);
+        done(dir, words);
+    }
+    image_is_whole(&std::fs::read(dir.join("mi.png")).unwrap());
+    let before = super::integrity::names(&dir.join("store"));
+    for words in [
+        "fit-link store --out store/link.json",
+        "link simulate perfect --episodes 3 --out store",
+        "link simulate perfect --episodes 3 --out store/drawn",
+        "estimate-mi store --plot store/mi.svg",
+        "train --scenario simple_spread --algorithm cc-maddpg --steps 25 --out store/run",
+        "report run --out store/report",
+    ] {
+        let (code, _, err) = run(dir, words);
+        assert!(code == 2 && err.contains("inside"), "{words}: {code}: {err}");
+        assert_eq!(super::integrity::names(&dir.join("store")), before, "{words}");
+    }
+}
+
+/// Every chunk of a PNG file has its length, and the last one is the end.
+fn image_is_whole(png: &[u8]) {
+    let (mut at, mut kinds) = (8, Vec::new());
+    while at < png.len() {
+        let length = u32::from_be_bytes(png[at..at + 4].try_into().unwrap()) as usize;
+        kinds.push(png[at + 4..at + 8].to_vec());
+        at += 12 + length;
+    }
+    assert_eq!((at, kinds[0].as_slice(), kinds[1].as_slice()), (png.len(), &b"IHDR"[..], &b"tEXt"[..]));
+    assert_eq!(kinds.last().unwrap(), b"IEND");
+}
+
+#[test]
+fn a_figure_of_an_earlier_link_goes_when_there_is_nothing_to_draw() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    done(dir, "link simulate dropout:0.5 --episodes 3 --out drawn");
+    assert!(dir.join("drawn/burst-lengths.svg").exists());
+    let (_, err) = done(dir, "link simulate perfect --episodes 3 --out drawn --force");
+    assert!(!dir.join("drawn/burst-lengths.svg").exists(), "it shows another link");
+    assert!(err.contains("wrote statistics.csv and 2 figures: drawn"), "{err}");
+}

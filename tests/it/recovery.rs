@@ -380,6 +380,24 @@ fn an_mcap_file_with_bad_chunks_gives_its_other_episodes() {
 }
 
 #[test]
+fn episodes_that_were_planned_and_never_recorded_are_not_lost() {
+    let layout = small();
+    let directory = tempfile::tempdir().unwrap();
+    let (path, saved) = (directory.path().join("store.mcap"), directory.path().join("saved"));
+    let mut sink = storage::create(&path, &Manifest { planned: 500_000, ..manifest(&layout) }, false).unwrap();
+    for i in 0..6 {
+        sink.append(&episode(&layout, i, 3, false)).unwrap();
+        sink.commit().unwrap(); // each in a chunk of its own
+    }
+    sink.finish().unwrap();
+    let bytes = fs::read(&path).unwrap();
+    let second = bytes.windows(8).enumerate().filter(|(_, w)| w == b"\x04\0\0\0zstd").nth(1).unwrap().0;
+    flip(&path, (second as u64 + 60) * 8);
+    assert_eq!(rescue(&path, &saved), (3, "lost: 1 of 6 episodes: 1\n".to_owned()));
+    assert_eq!(storage::open(&saved).unwrap().manifest().planned, 6);
+}
+
+#[test]
 fn one_file_gives_all_or_nothing() {
     let layout = small();
     let episodes = some(&layout, 40);

@@ -109,6 +109,13 @@ struct Messages {
 /// Bytes before the head of a message: the marker and the head's length.
 const PREFIX: u64 = 8;
 
+/// Longest head of a message that is looked for behind a torn one: a batch of a thousand agents has a shorter one.
+const FOLLOWING_HEAD: u64 = 1 << 20;
+
+/// Bytes that are read to find a message behind a torn one, for each byte of the file: whatever begins like a message has
+/// its head read, and a hostile file has such a beginning at every eighth byte.
+const SEARCHED: u64 = 16;
+
 impl Messages {
     fn take(&mut self, count: u64) -> std::io::Result<Option<Vec<u8>>> {
         if count > self.left {
@@ -156,8 +163,12 @@ impl Messages {
 
     /// Whether the rest of the file holds a whole message; they begin at multiples of eight bytes.
     fn batch_follows(&mut self) -> std::io::Result<bool> {
+        let mut budget = SEARCHED * self.size + FOLLOWING_HEAD;
         while let Some(prefix) = self.take(PREFIX)? {
-            let Some(length) = head_length(&prefix).filter(|length| *length < 1 << 20) else { continue };
+            let Some(length) = head_length(&prefix).filter(|length| *length < FOLLOWING_HEAD) else { continue };
+            // no end that a kill tears looks so often like a message: that is damage
+            let Some(rest) = budget.checked_sub(length) else { return Ok(true) };
+            budget = rest;
             let Some(head) = self.take(length)? else { continue };
             let body = root_as_message(&head).ok().and_then(|message| u64::try_from(message.bodyLength()).ok());
             if body.is_some_and(|body| body > 0 && body <= self.left) {
@@ -183,5 +194,24 @@ impl Read for Messages {
             self.whole = Cursor::new(self.message()?.unwrap_or_default());
         }
         self.whole.read(out)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_begins_like_a_message_everywhere_is_read_a_few_times_only() {
+        let begin = |length: u32| [[0xff; 4], length.to_le_bytes()].concat();
+        // a torn message, and heads of half a mebibyte at every eighth byte: 32 GiB, if each were read
+        let bytes = [begin(1 << 30), begin(1 << 19).repeat(1 << 17)].concat();
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("journal");
+        crate::io::write_atomic(&path, &bytes).unwrap();
+        let error = JournalReader::open(&path).map(drop).unwrap_err().to_string();
+        assert!(error.contains("the message at byte 0 of the journal is damaged"), "{error}");
+        crate::io::write_atomic(&path, &begin(1 << 30)).unwrap();
+        assert!(JournalReader::open(&path).unwrap().is_none(), "torn, and nothing else");
     }
 }
