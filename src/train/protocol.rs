@@ -2,9 +2,9 @@
 //!
 //! `paper`: when the run ends, 100 episodes on each of the eight channels, into `evaluation.parquet`, as
 //! `ccmarl evaluate` does. `standard` (Gorsane et al. 2022): 32 episodes over the training prior at even intervals and
-//! when the run ends, then ten times as many of the best policy of those, over the prior and on the eight channels, all into
-//! `evaluation_standard.parquet`. The best is chosen over the prior: no test channel is looked at. Test episodes come
-//! from a tree of their own, so a run learns the same with and without tests.
+//! when the run ends, then ten times as many of the best policy of those, over the prior and on the eight channels, all
+//! into `evaluation_standard.parquet`. The best is chosen over the prior: no test channel is looked at. Test episodes
+//! come from a tree of their own, so a run learns the same with and without tests.
 
 use polars::prelude::Column;
 use serde::{Deserialize, Serialize};

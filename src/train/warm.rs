@@ -9,7 +9,8 @@ impl Trainer {
     /// Fills replay and rings from a store, oldest episode first.
     ///
     /// # Errors
-    /// [`TrainError::Store`] when its agents, its world or its lengths do not fit, [`TrainError::Storage`] when it cannot be read.
+    /// [`TrainError::Store`] when its agents, its world or its lengths do not fit, [`TrainError::Storage`] when it cannot
+    /// be read.
     pub fn warm_start(&mut self, source: &mut dyn EpisodeSource) -> Result<u64, TrainError> {
         let (own, other) = (&self.layout.agents, &source.manifest().agents);
         if own != other {
