@@ -296,29 +296,6 @@ impl Actors {
         ))
     }
 
-    /// Checks that these actors were trained in this world, given as every constant of both; actors that know no world
-    /// fit every one.
-    ///
-    /// # Errors
-    /// [`RunPolicyError::DoesNotFit`] that names each constant that differs.
-    pub fn check_world(
-        trained: &Map<String, Value>,
-        here: &Map<String, Value>,
-        path: &Path,
-    ) -> Result<(), RunPolicyError> {
-        let shown = |map: &Map<String, Value>, key: &str| map.get(key).map_or("unset".to_owned(), ToString::to_string);
-        let mut keys: Vec<&String> = trained.keys().chain(here.keys().filter(|k| !trained.contains_key(*k))).collect();
-        keys.retain(|key| trained.get(*key) != here.get(*key));
-        if keys.is_empty() {
-            return Ok(());
-        }
-        let differences: Vec<String> = keys
-            .iter()
-            .map(|key| format!("{key} was {} in training and is {} here", shown(trained, key), shown(here, key)))
-            .collect();
-        Err(RunPolicyError::DoesNotFit { message: differences.join(", "), path: path.to_owned() })
-    }
-
     /// Least value of an action component; the largest is 1.
     pub fn low(&self) -> f32 {
         if self.output == Activation::Sigmoid { 0.0 } else { -1.0 }

@@ -59,7 +59,7 @@ pub enum Masks {
     /// Those drawn at rollout, `ι_t` for o and ι_{t+1} for o'.
     Kept,
     /// Those of another transition drawn from replay, the same for o and o' (as in Message-Dropout, for any prior):
-    /// the prior's law, but independent of where the agents are.
+    /// the prior's law, but independent of where the agents are. Shaping goes by the rollout's bits all the same.
     Redrawn,
 }
 

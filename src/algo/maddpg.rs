@@ -10,7 +10,8 @@
 //!
 //! Source: Lowe et al. 2017; the joint step and the constants are those of the paper's parent code (one critic, one
 //! actor loss). Lowe's own step, actor i's action alone from its policy and the others' from replay, is
-//! [`ActorStep::PerAgent`]. Link bits are those drawn at rollout, `ι_t` for o and ι_{t+1} for o'.
+//! [`ActorStep::PerAgent`]. Link bits are as drawn at rollout, `ι_t` for o and ι_{t+1} for o', or
+//! redrawn ([`Masks`](super::Masks)).
 //!
 //! The batch goes through in tiles of 128 rows, each through every network before the next, so that activations stay
 //! in the second-level cache.
@@ -38,7 +39,7 @@ pub struct Batch {
     pub next_link: Vec<bool>,
     /// Raw team reward `[B]`.
     pub reward: Vec<f32>,
-    /// Shaping bonus stored at rollout `[B]`; empty when shaping is computed on the minibatch or off.
+    /// Shaping bonus stored at rollout `[B]`; zeros when shaping is computed on the minibatch or off.
     pub bonus: Vec<f32>,
 }
 

@@ -26,8 +26,8 @@ saved every 2000 updates and at the end (`ccmarl list metric` says what each col
 --resume reads the run's own config.toml and goes on from its last checkpoint, to the same bytes as a run that was never
 stopped; with --steps it goes on for longer. Any other changed setting is refused.
 --evaluate paper tests the team at the end, as `ccmarl evaluate` does; --evaluate standard tests it on 32 episodes over the
-training link every 20000 steps and at the end the best on 320, over that link and on the eight channels
-(evaluation_standard.parquet).";
+training link every 20000 steps and at the end, then the best of those on 320, over that link and on the eight channels
+(evaluation_standard.parquet). A run that goes on removes its earlier tests.";
 
 /// Arguments of `train`.
 #[derive(Debug, clap::Args)]
@@ -56,7 +56,8 @@ pub(super) struct Args {
     /// Weight of CLUB on lost messages [default: the algorithm's]
     #[arg(long)]
     beta: Option<f64>,
-    /// Worlds stepped together [default: the episodes between two updates, the same run as with 1]
+    /// Worlds stepped together [default: the episodes between two updates, the same run as with 1; with more, a run
+    /// resumed for longer differs from one of that length]
     #[arg(long)]
     envs: Option<usize>,
     /// Tests that belong to the run: none, paper or standard [default: none]
@@ -157,6 +158,10 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     }
     let config = args.config()?;
     let protocol = config.evaluation.protocol;
+    if args.evaluate_every.is_some() && protocol != Protocol::Standard {
+        let message = "--evaluate-every needs --evaluate standard: no other protocol tests during training";
+        return Err(Error::Usage(message.to_owned()).into());
+    }
     let stop = stop_flag()?;
     let mut live = ui::Live::new(config.steps, "training");
     let options = Options {
@@ -182,6 +187,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
             ];
             ui::print_table(&["trained", ""], &rows.map(|(k, v)| vec![k.to_owned(), v]))?;
         }
+    }
+    for name in &report.removed {
+        ui::say(&format!("removed {name}: it was of the team before this run went on"));
     }
     if report.interrupted {
         ui::say(&format!("interrupted and saved; go on with: ccmarl train --out {out} --resume"));

@@ -216,6 +216,8 @@ mod tests {
             (vec![16, 32, 20], Relu, Tanh, 3),
             (vec![9, 16, 5], Relu, Sigmoid, 70),
             (vec![1, 17, 3], Tanh, Identity, 1),
+            (vec![9, 16, 5, 3], Relu, Tanh, 70),
+            (vec![9, 16, 5, 20], Sigmoid, Tanh, 131),
         ];
         for (case, (widths, hidden, output, rows)) in cases.into_iter().enumerate() {
             let mlp = Mlp::new(&widths, hidden, output);

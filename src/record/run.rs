@@ -28,7 +28,7 @@ use serde_json::{Map, Value};
 
 use super::{Build, Policy, PolicyEpisode, View, Widths, part, part_mut};
 use crate::algo::{Actors, RunPolicyError, Team, TeamScratch};
-use crate::registry::{Entry, RegistryError, Spec};
+use crate::registry::{Entry, RegistryError};
 use crate::rng::{self, Seeds, Stream};
 use crate::scenario::{self, Scenario, offsets};
 use crate::schema::AgentSpec;
@@ -147,13 +147,9 @@ impl Trained {
     /// # Errors
     /// [`RunPolicyError::DoesNotFit`] that names what differs; `path` is where the team came from.
     pub fn check_fit(&self, scenario: &dyn Scenario, path: &Path) -> Result<(), RunPolicyError> {
-        if let Some(Value::String(name)) = self.actors.scenario.get("name") {
-            let mut given = self.actors.scenario.clone();
-            given.retain(|key, value| key != "name" && !value.is_null());
-            // a constant that the program got since then has its default
-            let trained = scenario::build(&Spec { name: name.clone(), params: given }).map(|s| s.parameters());
-            let trained = trained.unwrap_or_else(|_| self.actors.scenario.clone());
-            Actors::check_world(&trained, &scenario.parameters(), path)?;
+        let differences = scenario::differences(&self.actors.scenario, scenario, "in training");
+        if !differences.is_empty() {
+            return Err(RunPolicyError::DoesNotFit { message: differences.join(", "), path: path.to_owned() });
         }
         let learners: Vec<&AgentSpec> = scenario.agents().iter().filter(|a| a.learner).collect();
         self.actors.check_fit(&learners, scenario.space().decoder.low(), path)

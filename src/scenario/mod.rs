@@ -170,6 +170,21 @@ pub trait Scenario: Send + Sync {
     }
 }
 
+/// Every constant, the name among them, in which a recorded world differs from this one, as "key was a `when` and is b
+/// here". A constant that was not recorded has its default; a record that names no world differs in nothing.
+pub fn differences(recorded: &Map<String, Value>, here: &dyn Scenario, when: &str) -> Vec<String> {
+    let Some(Value::String(name)) = recorded.get("name") else { return Vec::new() };
+    let mut params = recorded.clone();
+    params.retain(|key, value| key != "name" && !value.is_null());
+    let there = build(&Spec { name: name.clone(), params }).map_or_else(|_| recorded.clone(), |s| s.parameters());
+    let here = here.parameters();
+    let shown = |map: &Map<String, Value>, key: &str| map.get(key).map_or("unset".to_owned(), ToString::to_string);
+    let keys = there.keys().chain(here.keys().filter(|key| !there.contains_key(*key)));
+    keys.filter(|key| there.get(*key) != here.get(*key))
+        .map(|key| format!("{key} was {} {when} and is {} here", shown(&there, key), shown(&here, key)))
+        .collect()
+}
+
 /// Offsets of each agent's slice in a flat buffer, and the total as the last element.
 pub fn offsets(agents: &[AgentSpec], width: fn(&AgentSpec) -> usize) -> Vec<usize> {
     let mut offsets = vec![0];

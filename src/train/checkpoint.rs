@@ -6,9 +6,10 @@
 
 use super::arrays::Arrays;
 use super::config::TrainConfig;
+use super::directory::CHECKPOINTS;
 use super::estimator::Estimator;
 use super::metrics::MetricsRow;
-use super::protocol::TestRow;
+use super::protocol::{Best, TestRow};
 use super::trainer::Trainer;
 use super::{TrainError, difference};
 use crate::nn::{Adam, Params};
@@ -16,8 +17,10 @@ use crate::nn::{Adam, Params};
 /// The user's file of the actors as they stand.
 const ACTORS: &str = "actors.safetensors";
 /// The user's file of the best actors so far, under protocol `standard`.
-const BEST: &str = "best.safetensors";
+pub(super) const BEST: &str = "best.safetensors";
 const STATE: &str = "state.safetensors";
+/// All files of a checkpoint.
+pub(super) const FILES: [&str; 3] = [ACTORS, BEST, STATE];
 
 /// A part of a trainer's state. What is of fixed length must keep it.
 enum Slot<'a> {
@@ -108,13 +111,12 @@ fn visit_estimator(name: &str, estimator: &mut Estimator, see: See<'_>) -> Resul
 
 /// Writes all files; the state, by which a run goes on, last.
 pub(super) fn save(trainer: &mut Trainer) -> Result<(), TrainError> {
-    let dir = trainer.dir.join("checkpoint");
+    let dir = trainer.dir.join(CHECKPOINTS);
     let learner = &trainer.learner;
     let actors = learner.actors.to_bytes(&learner.params.actors.read(), trainer.step)?;
     crate::io::write_atomic(&dir.join(ACTORS), &actors)?;
-    let best = &trainer.tests.best;
-    if !best.params.is_empty() {
-        crate::io::write_atomic(&dir.join(BEST), &learner.actors.to_bytes(&best.params, best.step)?)?;
+    if !trainer.tests.best.params.is_empty() {
+        save_best(trainer, &trainer.tests.best)?;
     }
     let mut arrays = Arrays::default();
     let inconsistent = |message| TrainError::Value { name: "checkpoint".to_owned(), message };
@@ -136,9 +138,15 @@ pub(super) fn save(trainer: &mut Trainer) -> Result<(), TrainError> {
     Ok(crate::io::write_atomic(&dir.join(STATE), &bytes)?)
 }
 
+/// Writes the user's file of the best actors.
+pub(super) fn save_best(trainer: &Trainer, best: &Best) -> Result<(), TrainError> {
+    let bytes = trainer.learner.actors.to_bytes(&best.params, best.step)?;
+    Ok(crate::io::write_atomic(&trainer.dir.join(CHECKPOINTS).join(BEST), &bytes)?)
+}
+
 /// Brings a fresh trainer to where the checkpoint in its directory stands.
 pub(super) fn load(trainer: &mut Trainer) -> Result<(), TrainError> {
-    let path = trainer.dir.join("checkpoint").join(STATE);
+    let path = trainer.dir.join(CHECKPOINTS).join(STATE);
     let fail = |message: String| TrainError::Resume { message, path: path.clone() };
     if !path.exists() {
         return Err(fail("there is no checkpoint; start without --resume".to_owned()));

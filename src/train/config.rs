@@ -41,7 +41,8 @@ pub struct TrainConfig {
     #[serde(default = "hundred")]
     pub update_every: u64,
     /// Worlds stepped together, whole episodes each; as many episodes as lie between two updates when absent, which is
-    /// the paper's order (one world) to the bit. Beyond that the updates of a wave come when it has ended.
+    /// the paper's order (one world) to the bit. Beyond that the updates of a wave come when it has ended, and a run that
+    /// is resumed for longer is not the one of that length, whose waves end elsewhere.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub envs: Option<usize>,
     /// One row of metrics per this many updates.
@@ -207,7 +208,8 @@ pub enum PairSource {
 pub enum Shaping {
     /// On every minibatch, with the current estimators.
     Minibatch,
-    /// Once, when the episode ends, and stored (Algorithm 1 to the letter).
+    /// Once, when the episode ends, and stored (Algorithm 1 to the letter). Negatives are then actions of the same
+    /// episode.
     AtRollout,
 }
 
@@ -269,15 +271,28 @@ impl TrainConfig {
     /// # Errors
     /// [`TrainError::Io`], [`TrainError::Config`].
     pub fn read(path: &Path) -> Result<Self, TrainError> {
-        let text = crate::io::read_text(path, LIMIT)?;
+        let (config, text) = Self::parse(path)?;
         let refuse = |message: String| TrainError::Config { message, path: path.to_owned() };
-        let config: Self = toml::from_str(&text).map_err(|e| refuse(e.to_string().trim().replace('\n', "; ")))?;
         // a plugin's parameters are its own: what it refuses has no place in the file until it is looked for
         config.check_plugins().map_err(|error| match line_of(&text, &error.to_string()) {
             Some(line) => refuse(format!("line {line}: {error}")),
             None => refuse(error.to_string()),
         })?;
         Ok(config)
+    }
+
+    /// Reads a run's own file and its text, without building its scenario and prior: what those need (the trace of a
+    /// prior) may be gone when the run itself is still good.
+    ///
+    /// # Errors
+    /// As [`TrainConfig::read`].
+    pub fn parse(path: &Path) -> Result<(Self, String), TrainError> {
+        let text = crate::io::read_text(path, LIMIT)?;
+        let config = toml::from_str(&text).map_err(|e| TrainError::Config {
+            message: e.to_string().trim().replace('\n', "; "),
+            path: path.to_owned(),
+        })?;
+        Ok((config, text))
     }
 
     fn check_plugins(&self) -> Result<(), RegistryError> {

@@ -3,6 +3,8 @@
 use std::fs::{File, TryLockError};
 use std::path::Path;
 
+use super::checkpoint;
+use super::evaluate::EVALUATION_FILE;
 use super::protocol::STANDARD_FILE;
 use super::{TrainConfig, TrainError, Trainer};
 use crate::io::{self, IoError};
@@ -12,7 +14,7 @@ const RUN_FILES: [&str; 8] = [
     CONFIG,
     "metrics.parquet",
     "timings.parquet",
-    "evaluation.parquet",
+    EVALUATION_FILE,
     STANDARD_FILE,
     "mi.parquet",
     "events.out.tfevents.ccmarl",
@@ -21,7 +23,7 @@ const RUN_FILES: [&str; 8] = [
 
 /// The configuration, fully resolved; says that a directory is a run.
 pub(super) const CONFIG: &str = "config.toml";
-const CHECKPOINTS: &str = "checkpoint";
+pub(super) const CHECKPOINTS: &str = "checkpoint";
 
 /// Refuses an output directory that exists, or with `force` one that is not just a run.
 pub(super) fn refuse_foreign(dir: &Path, force: bool) -> Result<(), TrainError> {
@@ -29,10 +31,18 @@ pub(super) fn refuse_foreign(dir: &Path, force: bool) -> Result<(), TrainError> 
     if !dir.exists() {
         return Ok(());
     }
-    let names = names(dir)?;
-    let known = names.iter().all(|name| RUN_FILES.contains(&name.as_str()) || is_leftover(name));
-    let run = names.is_empty() || TrainConfig::read(&dir.join(CONFIG)).is_ok();
-    if known && run { Ok(()) } else { Err(IoError::Foreign(dir.to_owned()).into()) }
+    let own = names(dir)?;
+    if !own.is_empty() && TrainConfig::parse(&dir.join(CONFIG)).is_err() {
+        return Err(IoError::Foreign(dir.to_owned()).into());
+    }
+    let checkpoints = dir.join(CHECKPOINTS);
+    let below = if checkpoints.is_dir() { names(&checkpoints)? } else { Vec::new() };
+    for (folder, names, known) in [(dir, own, &RUN_FILES[..]), (&checkpoints, below, &checkpoint::FILES)] {
+        if let Some(name) = names.iter().find(|name| !known.contains(&name.as_str()) && !is_leftover(name)) {
+            return Err(IoError::ForeignEntry { entry: name.into(), path: folder.to_owned() }.into());
+        }
+    }
+    Ok(())
 }
 
 /// Holds a directory for this process, if it is there: two that train into one would undo each other's work. The
@@ -79,19 +89,31 @@ pub(super) fn remove_leftovers(dir: &Path) -> Result<(), TrainError> {
     Ok(())
 }
 
+/// Removes the tests of a run that is about to go on: they are of the team that it had. Returns their names.
+pub(super) fn remove_tests(trainer: &Trainer) -> Result<Vec<&'static str>, TrainError> {
+    if trainer.tests.best.params.is_empty() {
+        io::remove(&trainer.dir.join(CHECKPOINTS).join(checkpoint::BEST))?; // otherwise the next checkpoint's is its
+    }
+    let there = |name: &&str| trainer.dir.join(name).exists();
+    let names: Vec<_> = [EVALUATION_FILE, STANDARD_FILE].into_iter().filter(there).collect();
+    names.iter().try_for_each(|name| io::remove(&trainer.dir.join(name)))?;
+    Ok(names)
+}
+
 /// Whether a name is that of a file on its way to one of a run's names: `.<name>.` and random letters.
 fn is_leftover(name: &str) -> bool {
     let Some((stem, ending)) = name.strip_prefix('.').and_then(|rest| rest.rsplit_once('.')) else { return false };
-    let ours = RUN_FILES.contains(&stem) || stem.ends_with(".safetensors");
+    let ours = RUN_FILES.contains(&stem) || checkpoint::FILES.contains(&stem);
     ours && ending.len() == 6 && ending.chars().all(|c| c.is_ascii_alphanumeric())
 }
 
-/// Names in a directory; one that is not UTF-8 is nobody's of ours.
+/// Names in a directory, sorted; one that is not UTF-8 is nobody's of ours.
 fn names(dir: &Path) -> Result<Vec<String>, TrainError> {
     let mut names = Vec::new();
     for entry in std::fs::read_dir(dir).map_err(IoError::os("list", dir))? {
         names.push(entry.map_err(IoError::os("list", dir))?.file_name().to_string_lossy().into_owned());
     }
+    names.sort();
     Ok(names)
 }
 
@@ -104,8 +126,13 @@ mod tests {
         for ours in [".metrics.parquet.a1B2c3", ".state.safetensors.ABCdef", ".config.toml.000000"] {
             assert!(is_leftover(ours), "{ours}");
         }
-        for foreign in ["metrics.parquet.a1B2c3", ".thesis.tex.a1B2c3", ".metrics.parquet.a1B2c34", ".metrics.parquet"]
-        {
+        for foreign in [
+            ".thesis.safetensors.a1B2c3",
+            "metrics.parquet.a1B2c3",
+            ".thesis.tex.a1B2c3",
+            ".metrics.parquet.a1B2c34",
+            ".metrics.parquet",
+        ] {
             assert!(!is_leftover(foreign), "{foreign}");
         }
     }

@@ -265,16 +265,20 @@ impl Dumie {
     pub fn bonus_at_rollout(&mut self, episode: &Episode, rng: &mut Stream) -> Vec<f32> {
         let mut bonus = Vec::new();
         if self.config.shaping == Shaping::AtRollout {
-            let rows = episode.steps;
-            let mut batch = Batch { rows, ..Batch::default() };
-            for row in 0..rows {
+            // negatives are cyclic shifts: in the order of time all would lie equally far off
+            let order = rng::permutation(rng, episode.steps);
+            let (mut batch, links) = (Batch { rows: episode.steps, ..Batch::default() }, self.learners.len().pow(2));
+            for &row in &order {
                 for &agent in &self.learners {
                     batch.observations.extend_from_slice(episode.observations[agent].row(row));
                     batch.actions.extend_from_slice(episode.actions[agent].row(row));
                 }
+                batch.link.extend_from_slice(&episode.link[row * links..(row + 1) * links]);
             }
-            batch.link.extend_from_slice(&episode.link[..rows * self.learners.len() * self.learners.len()]);
-            self.bonus(&batch, rng, &mut bonus);
+            let mut found = Vec::new();
+            self.bonus(&batch, rng, &mut found);
+            bonus.resize(episode.steps, 0.0);
+            order.iter().zip(found).for_each(|(&row, value)| bonus[row] = value);
         }
         bonus
     }
@@ -438,5 +442,21 @@ mod tests {
         assert!(spread > 0.01, "{stored:?}");
         dumie.config.shaping = Shaping::Minibatch;
         assert!(dumie.bonus_at_rollout(&e, &mut Seeds::new(6).stream("b")).is_empty());
+    }
+
+    #[test]
+    fn the_negatives_of_an_episode_do_not_all_lie_equally_far_off_in_time() {
+        let config = DumieConfig { negatives: Negatives::Count(1), shaping: Shaping::AtRollout, ..config() };
+        let (mut dumie, _) = trained_as(config, [1.0, 0.0]);
+        // b hears and does 1, −1, 1, …: a shift in time would give equal steps equal negatives
+        let sign = |t: usize| if t.is_multiple_of(2) { 1.0 } else { -1.0 };
+        let mut e = Episode { steps: 24, link: [true, true, false, true].repeat(25), ..Episode::default() };
+        e.observations = vec![Matrix { data: (0..25).map(sign).collect(), width: 1 }; 2];
+        e.actions = vec![Matrix { data: (0..24).map(sign).collect(), width: 1 }; 2];
+        for stream in 0..5 {
+            let bonus = dumie.bonus_at_rollout(&e, &mut Seeds::new(6).indexed_stream("b", stream));
+            let distinct: std::collections::BTreeSet<u32> = bonus.iter().step_by(2).map(|b| b.to_bits()).collect();
+            assert!(distinct.len() > 1, "{bonus:?}");
+        }
     }
 }

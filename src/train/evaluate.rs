@@ -11,6 +11,9 @@ use crate::record::{self, Policy, Recording, returns};
 use crate::rng::Seeds;
 use crate::scenario::Scenario;
 
+/// File of the tests that `ccmarl evaluate` and protocol `paper` make.
+pub(super) const EVALUATION_FILE: &str = "evaluation.parquet";
+
 /// Columns of `evaluation.parquet`, one row per test episode.
 pub const EVALUATION_COLUMNS: [&str; 9] =
     ["scenario", "agents", "algorithm", "prior", "seed", "channel", "episode", "return", "loss_rate"];
@@ -72,7 +75,7 @@ pub fn write_evaluation(
     learners: usize,
     rows: &[EvaluationRow],
 ) -> Result<(), TrainError> {
-    metrics::write_parquet(&dir.join("evaluation.parquet"), columns(config, learners, rows))
+    metrics::write_parquet(&dir.join(EVALUATION_FILE), columns(config, learners, rows))
 }
 
 /// [`EVALUATION_COLUMNS`] of these rows.

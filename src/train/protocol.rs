@@ -1,16 +1,16 @@
 //! Tests that belong to a run: what is tested, when, and on which episodes.
 //!
 //! `paper`: when the run ends, 100 episodes on each of the eight channels, into `evaluation.parquet`, as
-//! `ccmarl evaluate` does. `standard` (Gorsane et al. 2022): 32 episodes over the training prior at even intervals, and
-//! when the run ends ten times as many of the best policy so far, over the prior and on the eight channels, all into
-//! `evaluation_standard.parquet`. The best is chosen over the prior: no test channel is looked at. Test episodes come
-//! from a tree of their own, so a run learns the same with and without tests.
+//! `ccmarl evaluate` does. `standard` (Gorsane et al. 2022): 32 episodes over the training prior at even intervals and
+//! when the run ends, then ten times as many of the best policy of those, over the prior and on the eight channels, all
+//! into `evaluation_standard.parquet`. The best is chosen over the prior: no test channel is looked at. Test episodes
+//! come from a tree of their own, so a run learns the same with and without tests.
 
 use polars::prelude::Column;
 use serde::{Deserialize, Serialize};
 
 use super::evaluate::{EvaluationRow, columns, evaluate, evaluation_seed, write_evaluation};
-use super::{TrainError, Trainer, metrics};
+use super::{TrainError, Trainer, checkpoint, metrics};
 use crate::link::{Channel, suite};
 use crate::record::{ActionNoise, Trained};
 use crate::rng::Seeds;
@@ -24,7 +24,7 @@ pub enum Protocol {
     None,
     /// At the end, on the suite.
     Paper,
-    /// At even intervals, and the best again.
+    /// At even intervals and at the end, and the best again.
     Standard,
 }
 
@@ -34,7 +34,8 @@ pub enum Protocol {
 pub struct EvaluationConfig {
     /// Which tests belong to the run: none, paper, standard.
     pub protocol: Protocol,
-    /// Environment steps between two tests of `standard`. Not a share of `steps`: a longer run tests at the same places.
+    /// Environment steps between two tests of `standard`, which tests at the end besides. Not a share of `steps`: a
+    /// longer run tests at the same places.
     pub every: u64,
     /// Episodes per test and channel; 100 (`paper`) or 32 (`standard`) when absent.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -48,11 +49,19 @@ impl Default for EvaluationConfig {
 }
 
 impl EvaluationConfig {
+    /// Episodes that the largest test over the training prior plays.
+    pub(super) fn over_prior(&self) -> u64 {
+        if self.protocol == Protocol::Standard { self.episodes().saturating_mul(RETEST) } else { 0 }
+    }
+
     /// Episodes per test and channel.
     pub fn episodes(&self) -> u64 {
         self.episodes.unwrap_or(if self.protocol == Protocol::Paper { 100 } else { 32 })
     }
 }
+
+/// How many times as many episodes the best is tested on.
+const RETEST: u64 = 10;
 
 /// The channel id of the link that a run trains over.
 const PRIOR: &str = "prior";
@@ -89,7 +98,7 @@ impl TestRow {
     }
 }
 
-/// The policy with the highest mean return of an interval's test; no parameters where none was tested.
+/// The policy with the highest mean return of a test over the prior; no parameters where none was tested.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Best {
     pub(super) params: Vec<f32>,
@@ -111,23 +120,30 @@ impl Trainer {
         if protocol != Protocol::Standard || before / every == self.step / every {
             return Ok(());
         }
-        let params = self.learner.params.actors.read().to_vec();
         let interval = Seeds::new(evaluation_seed(&self.config)).indexed("interval", self.step / every);
-        let (channels, episodes) = ([self.prior_channel()?], self.config.evaluation.episodes());
-        let found = self.test(&params, &channels, episodes, interval.seed())?;
+        let mut tests = std::mem::take(&mut self.tests);
+        let mean = self.test_over_prior(&mut tests, interval.seed());
+        self.tests = tests;
+        self.means.add("evaluation_return", mean?);
+        Ok(())
+    }
+
+    /// Tests the policy over the training prior on the episodes of `seed`, and adds what it found; the mean return.
+    fn test_over_prior(&self, tests: &mut Tests, seed: u64) -> Result<f64, TrainError> {
+        let params = self.learner.params.actors.read().to_vec();
+        let found = self.test(&params, &[self.prior_channel()?], self.config.evaluation.episodes(), seed)?;
         let mean = found.iter().map(|r| r.episode_return).sum::<f64>() / found.len() as f64;
-        self.means.add("evaluation_return", mean);
         let step = self.step;
-        self.tests.rows.extend(found.iter().map(|r| TestRow {
+        tests.rows.extend(found.iter().map(|r| TestRow {
             step,
             episode: r.episode,
             episode_return: r.episode_return,
             loss_rate: r.loss_rate,
         }));
-        if self.tests.best.params.is_empty() || mean > self.tests.best.mean {
-            self.tests.best = Best { params, mean, step };
+        if tests.best.params.is_empty() || mean > tests.best.mean {
+            tests.best = Best { params, mean, step };
         }
-        Ok(())
+        Ok(mean)
     }
 
     /// The tests that end a run, into its directory.
@@ -144,31 +160,37 @@ impl Trainer {
                 write_evaluation(&self.dir, &self.config, self.learner.actors.len(), &rows)
             }
             Protocol::Standard => {
+                let seeds = Seeds::new(evaluation_seed(&self.config));
+                // not kept in the checkpoint: a run that goes on from here has no test at this step
+                let mut tests = self.tests.clone();
+                if tests.rows.last().is_none_or(|row| row.step != self.step) {
+                    self.test_over_prior(&mut tests, seeds.child("final").seed())?;
+                }
                 let mut channels = vec![self.prior_channel()?];
                 channels.extend(suite("paper")?);
-                let best = &self.tests.best;
-                let seed = Seeds::new(evaluation_seed(&self.config)).child("absolute").seed();
-                let last = if best.params.is_empty() {
-                    Vec::new()
-                } else {
-                    self.test(&best.params, &channels, 10 * episodes, seed)?
-                };
-                self.write_standard(&last)
+                let last = self.test(
+                    &tests.best.params,
+                    &channels,
+                    episodes.saturating_mul(RETEST),
+                    seeds.child("absolute").seed(),
+                )?;
+                checkpoint::save_best(self, &tests.best)?;
+                self.write_standard(&tests, &last)
             }
         }
     }
 
-    fn write_standard(&self, last: &[EvaluationRow]) -> Result<(), TrainError> {
+    fn write_standard(&self, tests: &Tests, last: &[EvaluationRow]) -> Result<(), TrainError> {
         let interval = |r: &TestRow| EvaluationRow {
             channel: PRIOR.to_owned(),
             episode: r.episode,
             episode_return: r.episode_return,
             loss_rate: r.loss_rate,
         };
-        let rows: Vec<EvaluationRow> = self.tests.rows.iter().map(interval).chain(last.iter().cloned()).collect();
-        let mut steps: Vec<i64> = self.tests.rows.iter().map(|r| r.step as i64).collect();
+        let rows: Vec<EvaluationRow> = tests.rows.iter().map(interval).chain(last.iter().cloned()).collect();
+        let mut steps: Vec<i64> = tests.rows.iter().map(|r| r.step as i64).collect();
         let intervals = steps.len();
-        steps.resize(rows.len(), self.tests.best.step as i64);
+        steps.resize(rows.len(), tests.best.step as i64);
         let mut table = columns(&self.config, self.learner.actors.len(), &rows);
         table.push(Column::new(STANDARD_COLUMNS[0].0.into(), steps));
         let best: Vec<bool> = (0..rows.len()).map(|row| row >= intervals).collect();

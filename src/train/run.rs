@@ -44,6 +44,9 @@ pub struct Report {
     pub next_critic_loss: Option<f64>,
     /// Whether it was stopped before its last step.
     pub interrupted: bool,
+    /// Files of earlier tests that were removed when the run went on, and that it did not write anew.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub removed: Vec<&'static str>,
 }
 
 /// Trains as `config` says into the run directory `dir`, which gets `config.toml`, `metrics.parquet`, `timings.parquet`,
@@ -76,8 +79,12 @@ pub fn train(
         None => None,
     };
     // nothing that was there is touched before everything that can be refused has been
+    let mut removed = Vec::new();
     let _new = if options.resume {
         directory::remove_leftovers(dir)?;
+        if trainer.step < trainer.config.steps {
+            removed = directory::remove_tests(&trainer)?;
+        }
         directory::write_config(&trainer)?;
         None
     } else {
@@ -103,6 +110,7 @@ pub fn train(
     if !interrupted {
         trainer.test_at_end()?;
     }
+    removed.retain(|name| !dir.join(name).exists());
     Ok(Report {
         steps: trainer.step,
         updates: trainer.update,
@@ -110,5 +118,6 @@ pub fn train(
         return_mean: trainer.return_mean(),
         next_critic_loss: trainer.next_critic_loss(),
         interrupted,
+        removed,
     })
 }

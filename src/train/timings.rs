@@ -29,7 +29,10 @@ pub const TIMING_COLUMNS: [(&str, &str); 5] = [
     ("update_seconds", "wall time spent on updates since the last row"),
     ("evaluation_seconds", "wall time spent on tests since the last row"),
     ("checkpoint_seconds", "wall time spent on writing the run directory since the last row"),
-    ("steps_per_second", "environment steps since the last row, per second of these four together"),
+    (
+        "steps_per_second",
+        "environment steps since the last row (or the checkpoint that a process went on from), per second of these four together",
+    ),
 ];
 
 /// One row: step, update, and the values of [`TIMING_COLUMNS`].
@@ -45,6 +48,8 @@ struct Row {
 pub(super) struct Clock {
     since: Option<Instant>,
     spent: [f64; 4],
+    /// Environment steps where the time that is being counted began.
+    from: u64,
     rows: Vec<Row>,
 }
 
@@ -66,13 +71,14 @@ impl Clock {
     pub(super) fn log(&mut self, step: u64, update: u64) {
         self.stop(Phase::Update);
         let [a, b, c, d] = std::mem::take(&mut self.spent);
-        let steps = step - self.rows.last().map_or(0, |row| row.step);
+        let steps = step - std::mem::replace(&mut self.from, step);
         self.rows.push(Row { step, update, values: [a, b, c, d, steps as f64 / (a + b + c + d)] });
     }
 
-    /// Takes over the rows that an earlier process wrote up to `update`. What cannot be read is left out: it decides
-    /// nothing.
-    pub(super) fn resume(&mut self, dir: &Path, update: u64) {
+    /// Takes over the rows that an earlier process wrote up to `update`, and counts from environment step `step` on. What
+    /// cannot be read is left out: it decides nothing.
+    pub(super) fn resume(&mut self, dir: &Path, step: u64, update: u64) {
+        self.from = step;
         self.rows = crate::io::caught(|| read(&dir.join(FILE))).flatten().unwrap_or_default();
         self.rows.retain(|row| row.update <= update);
     }
@@ -119,10 +125,13 @@ mod tests {
         }
         clock.write(dir.path()).unwrap();
         let mut later = Clock::default();
-        later.resume(dir.path(), 3);
+        later.resume(dir.path(), 350, 3);
         assert_eq!(later.rows, clock.rows[..3]);
+        later.spent = [2.0, 0.0, 0.0, 0.0];
+        later.log(400, 4);
+        assert!((later.rows[3].values[4] - 25.0).abs() < 0.1, "50 steps in two seconds: {:?}", later.rows[3]);
         crate::io::write_atomic(&dir.path().join(FILE), b"not a table").unwrap();
-        later.resume(dir.path(), 3);
+        later.resume(dir.path(), 300, 3);
         assert_eq!(later.rows, []);
     }
 }

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use super::config::{Shaping, TrainConfig};
 use super::dumie::Dumie;
 use super::metrics::{self, Means, MetricsRow};
-use super::protocol::Tests;
+use super::protocol::{EvaluationConfig, Protocol, Tests};
 use super::replay::{Replay, Ring};
 use super::timings::{Clock, Phase};
 use super::{TrainError, checkpoint, finite};
@@ -78,7 +78,8 @@ impl Trainer {
             message: "the configuration is not resolved".to_owned(),
         })?;
         let prior = build_link(prior, scenario.as_ref())?;
-        check_link(prior.as_ref(), config.steps.div_ceil(scenario.steps() as u64))?;
+        let episodes = config.steps.div_ceil(scenario.steps() as u64);
+        check_link(prior.as_ref(), episodes.max(config.evaluation.over_prior()))?;
         let layout = scenario.layout();
         let seeds = Seeds::new(config.seed).child("train");
         let learners: Vec<_> = layout.agents.iter().filter(|a| a.learner).collect();
@@ -131,7 +132,8 @@ impl Trainer {
         let policy =
             serde_json::json!({"name": "training", "algorithm": self.config.algorithm, "steps": self.config.steps});
         let (scenario, link) = (self.scenario.parameters().into(), self.prior.parameters().into());
-        Manifest::new(self.config.seed, scenario, link, policy, &self.layout)
+        let planned = self.config.steps.div_ceil(self.scenario.steps() as u64);
+        Manifest { planned, ..Manifest::new(self.config.seed, scenario, link, policy, &self.layout) }
     }
 
     /// Puts an episode into replay and rings, as if it had been rolled out here.
@@ -148,12 +150,14 @@ impl Trainer {
         self.replay.push(episode, &bonus)
     }
 
-    /// Episodes that are played before the next update may come: at most `envs`, and none beyond the last step.
+    /// Episodes that are played before the next update or test may come: at most `envs`, and none beyond the last step.
     fn wave(&self) -> usize {
         let (steps, every) = (self.scenario.steps() as u64, self.config.update_every);
         let envs = self.config.envs() as u64;
-        let to_update = (every - self.step % every).div_ceil(steps);
-        let until = if envs.saturating_mul(steps) <= every { to_update } else { envs };
+        let to_next = |every: u64| (every - self.step % every).div_ceil(steps);
+        let EvaluationConfig { protocol, every: tests, .. } = self.config.evaluation;
+        let to_test = if protocol == Protocol::Standard { to_next(tests) } else { u64::MAX };
+        let until = if envs.saturating_mul(steps) <= every { to_next(every).min(to_test) } else { envs };
         let left = self.config.steps.saturating_sub(self.step).div_ceil(steps).max(1);
         envs.min(until).min(left) as usize
     }
@@ -209,10 +213,15 @@ impl Trainer {
         let mut rng = self.seeds.indexed_stream("update", update);
         let rows = self.config.maddpg.batch.unwrap_or(MaddpgConfig::BATCH);
         self.replay.sample(&mut rng, rows, &mut self.batch);
-        if self.config.maddpg.masks == Masks::Redrawn {
-            self.replay.redraw_links(&mut rng, &mut self.batch);
-        }
         rng
+    }
+
+    /// Gives the learner the link bits that it is to see, where those are not the rollout's. The Du-MIE has read the
+    /// minibatch by then: what a message tells, and whether it arrived, are of the rollout.
+    fn redraw_masks(&mut self, update: u64) {
+        if self.config.maddpg.masks == Masks::Redrawn {
+            self.replay.redraw_links(&mut self.seeds.indexed_stream("masks", update), &mut self.batch);
+        }
     }
 
     /// Critic loss of the minibatch that the next update will draw, on the raw reward; nothing changes.
@@ -221,6 +230,7 @@ impl Trainer {
             return None;
         }
         self.draw(self.update);
+        self.redraw_masks(self.update);
         Some(self.learner.td_loss(&self.batch))
     }
 
@@ -250,6 +260,7 @@ impl Trainer {
             self.means.add("shaping_mean", mean);
             self.means.add("shaping_std", variance.sqrt());
         }
+        self.redraw_masks(self.update);
         let found = self.learner.update(&self.batch, &self.bonus)?;
         self.stale = true;
         if !found.is_finite() || !self.bonus.iter().all(|b| b.is_finite()) {
@@ -299,7 +310,7 @@ impl Trainer {
     pub fn resume(&mut self) -> Result<(), TrainError> {
         checkpoint::load(self)?;
         self.stale = true;
-        self.clock.resume(&self.dir, self.update);
+        self.clock.resume(&self.dir, self.step, self.update);
         Ok(())
     }
 

@@ -1,6 +1,7 @@
 //! Warm starts: a store's episodes in replay and rings, as if they had been rolled out here.
 
 use super::{TrainError, Trainer};
+use crate::scenario;
 use crate::schema::AgentSpec;
 use crate::storage::EpisodeSource;
 
@@ -8,7 +9,8 @@ impl Trainer {
     /// Fills replay and rings from a store, oldest episode first.
     ///
     /// # Errors
-    /// [`TrainError::Store`] when its agents or lengths do not fit, [`TrainError::Storage`] when it cannot be read.
+    /// [`TrainError::Store`] when its agents, its world or its lengths do not fit, [`TrainError::Storage`] when it cannot
+    /// be read.
     pub fn warm_start(&mut self, source: &mut dyn EpisodeSource) -> Result<u64, TrainError> {
         let (own, other) = (&self.layout.agents, &source.manifest().agents);
         if own != other {
@@ -29,6 +31,11 @@ impl Trainer {
                 name(own),
                 name(other)
             )));
+        }
+        let world = source.manifest().scenario.as_object();
+        let differences = world.map(|world| scenario::differences(world, self.scenario.as_ref(), "in the store"));
+        if let Some(differences) = differences.filter(|found| !found.is_empty()) {
+            return Err(TrainError::Store(format!("another world: {}", differences.join(", "))));
         }
         if self.dumie.is_none() {
             return self.replay.fill(source); // rings need episodes, replay does not

@@ -26,4 +26,5 @@ mod signals;
 mod stats;
 mod stores;
 mod train;
+mod train_runs;
 mod worlds;

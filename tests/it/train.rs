@@ -7,7 +7,7 @@ use ccmarl::registry::Spec;
 use ccmarl::train::{EvaluationConfig, Options, Protocol, Report, TrainConfig, Trainer, train};
 use polars::prelude::{DataFrame, ParquetReader, SerReader as _};
 
-fn config(algorithm: &str, steps: u64) -> TrainConfig {
+pub(crate) fn config(algorithm: &str, steps: u64) -> TrainConfig {
     let mut config = TrainConfig::new(Spec::new("simple_spread"), algorithm);
     config.steps = steps;
     config.log_every = 5;
@@ -16,11 +16,11 @@ fn config(algorithm: &str, steps: u64) -> TrainConfig {
     config
 }
 
-fn run(config: TrainConfig, dir: &Path, options: &Options<'_>) -> Report {
+pub(crate) fn run(config: TrainConfig, dir: &Path, options: &Options<'_>) -> Report {
     train(config, dir, options, &mut |_| {}, &AtomicBool::new(false)).unwrap()
 }
 
-fn bytes(dir: &Path, file: &str) -> Vec<u8> {
+pub(crate) fn bytes(dir: &Path, file: &str) -> Vec<u8> {
     std::fs::read(dir.join(file)).unwrap_or_else(|e| panic!("{file}: {e}"))
 }
 
@@ -39,11 +39,11 @@ fn walk(dir: &Path) -> Vec<String> {
     found
 }
 
-fn frame(path: &Path) -> DataFrame {
+pub(crate) fn frame(path: &Path) -> DataFrame {
     ParquetReader::new(std::fs::File::open(path).unwrap()).finish().unwrap()
 }
 
-fn ints(frame: &DataFrame, column: &str) -> Vec<i64> {
+pub(crate) fn ints(frame: &DataFrame, column: &str) -> Vec<i64> {
     frame.column(column).unwrap().i64().unwrap().iter().map(|v| v.unwrap()).collect()
 }
 
@@ -51,7 +51,8 @@ fn texts(frame: &DataFrame, column: &str) -> Vec<String> {
     frame.column(column).unwrap().str().unwrap().iter().map(|v| v.unwrap().to_owned()).collect()
 }
 
-const LEARNED: [&str; 3] = ["checkpoint/actors.safetensors", "metrics.parquet", "events.out.tfevents.ccmarl"];
+pub(crate) const LEARNED: [&str; 3] =
+    ["checkpoint/actors.safetensors", "metrics.parquet", "events.out.tfevents.ccmarl"];
 
 #[test]
 fn cc_maddpg_without_weights_is_dropout_maddpg_byte_for_byte_and_with_weights_it_is_not() {
@@ -416,7 +417,7 @@ fn force_replaces_a_run_and_nothing_else() {
     assert!(path.join("metrics.parquet").exists(), "a refused command removed the run");
     again(&force).unwrap();
     ccmarl::io::write_atomic(&path.join("thesis.tex"), b"mine").unwrap();
-    assert!(again(&force).unwrap_err().to_string().contains("ccmarl did not make"));
+    assert!(again(&force).unwrap_err().to_string().contains("ccmarl did not put there: thesis.tex"));
     assert_eq!(bytes(&path, "thesis.tex"), b"mine");
 }
 
