@@ -176,7 +176,7 @@ fn three_seeds_give_intervals_and_a_best_row() {
     assert!(!row("fc-maddpg").contains("**"));
     assert!(text.contains("95 % Student interval"), "{text}");
     let page = read(dir.path().join("r/index.html"));
-    assert!(page.contains("bands their 95 % intervals") && !page.contains("fewer than three seeds: read"));
+    assert!(page.contains("means over seeds with 95 % intervals") && !page.contains("fewer than three seeds: read"));
 }
 
 #[test]
