@@ -14,6 +14,7 @@ use super::{Estimate, Kind, MiError, Protocol, Unit, p_value};
 use crate::registry::{RegistryError, Spec};
 use crate::rng::Seeds;
 use crate::schema::{Columns, Samples};
+use crate::stats::mean;
 
 /// Standardised distances that differ by less are equal: what rounding makes of values on a grid.
 const SAME: f64 = 1e-14;
@@ -165,10 +166,6 @@ impl Limits {
 fn picked(points: &Points, rows: &[u32]) -> Points {
     let data = rows.iter().flat_map(|&r| points.row(r as usize).iter().copied()).collect();
     Points { data, width: points.width }
-}
-
-fn mean(values: &[f64]) -> f64 {
-    values.iter().sum::<f64>() / values.len() as f64
 }
 
 /// The value of `ksg1` alone, in nats, on rows that are finite and already scaled: x `[n, d_x]`, y `[n, d_y]`.
