@@ -8,7 +8,8 @@ use clap::ValueHint;
 use super::args::end_on_signals;
 use super::estimates::{class, place, print, split, writer};
 use super::jobs::{Gathered, gather};
-use super::{Outcome, heatmap, ui};
+use super::plot::{self, View};
+use super::{Outcome, ui};
 use crate::Error;
 use crate::mi::{self, ESTIMATORS, Estimate, Plan, Protocol};
 use crate::pairs::{self, PairsError, TableOptions};
@@ -24,6 +25,7 @@ Examples:
   ccmarl estimate-mi table.parquet --x a,b --y c --estimator gaussian,jsd --group subject
   ccmarl estimate-mi table.csv --x a --y b --estimator ksg,ksg:10,gcmi
   ccmarl estimate-mi table.csv --x a --y b --given c --estimator gaussian,ksg --unit bits
+  ccmarl estimate-mi table.csv --x a --y b --estimator gaussian,ksg,infonce --plot pair.svg
   ccmarl estimate-mi table.csv --all-pairs --estimator gcmi --plot pairs.svg
   ccmarl estimate-mi table.csv --x 'regex:^obs_' --y action --time t --lag 0..10 --estimator ksg
   ccmarl estimate-mi table.csv --x job --y city --estimator discrete --format csv
@@ -101,7 +103,8 @@ pub(super) struct Args {
     /// Also write the rows to a .json, .csv or .parquet file
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     out: Option<PathBuf>,
-    /// Draw the first estimator's values as a heat map of links, or of --all-pairs: a .svg or .png file
+    /// Draw a .svg or .png file: of one pair its points, estimates with intervals, the value on halves and quarters of the
+    /// samples, training; of several lags the values over them; of links or --all-pairs a heat map of the first estimator
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     plot: Option<PathBuf>,
     /// Replace --out and --plot if they exist
@@ -168,10 +171,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     end_on_signals()?;
     let plan = plan(args)?;
     let write = args.out.as_deref().map(|path| writer(path, &args.path, args.force)).transpose()?;
-    let plot = args.plot.as_deref().map(|path| heatmap::target(path, args.force)).transpose()?;
-    if plot.is_some() {
-        refuse_undrawable(args)?;
-    }
+    let plot = args.plot.as_deref().map(|path| Ok((view(args)?, plot::target(path, args.force)?)));
+    let plot = plot.transpose().map_err(|error: Error| error)?;
     let samples = Arc::new(samples(args)?);
     let plan = Arc::new(plan);
     let total = samples.len() * plan.estimators.len();
@@ -202,8 +203,12 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         Form::Parquet => ui::print_bytes(&mi::to_parquet(&rows).map_err(anyhow::Error::msg)?),
     };
     // after the results, which a picture that cannot be drawn must not take away, and even if nobody reads them
-    if !interrupted {
-        plot.map_or(Ok(()), |target| heatmap::draw(&rows, &target))?;
+    if let Some((view, target)) = plot.filter(|_| !interrupted) {
+        let failed: Vec<&str> = failures.iter().map(|(job, _)| job.estimator.as_str()).collect();
+        if !plot::draw(view, &rows, &failed, (&samples, &plan), args.threads, &target)? {
+            ui::say("interrupted: all estimates are shown, and no picture was drawn");
+            return Ok(Outcome::Interrupted);
+        }
     }
     printed?;
     for (job, error) in &failures {
@@ -217,17 +222,17 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// A heat map has one cell per pair: several lags would fall into one, and columns that are moved in time are other
-/// columns on one axis only.
-fn refuse_undrawable(args: &Args) -> Result<(), Error> {
-    let message = if !args.all_pairs && !args.x.is_empty() {
-        "--plot draws a matrix: give --all-pairs, or a store"
-    } else if args.lag.len() > 1 {
-        "--plot draws one lag: give --lag one number"
-    } else if args.all_pairs && args.lag.iter().any(|&lag| lag > 0) {
-        "--plot of --all-pairs is for columns at the same time: leave out --lag"
-    } else {
-        return Ok(());
+/// What `--plot` shows. A heat map has one cell per pair: several lags would fall into one, and columns that are moved
+/// in time are other columns on one axis only.
+fn view(args: &Args) -> Result<View, Error> {
+    let message = match (args.all_pairs, args.lag.len() > 1) {
+        (false, true) => return Ok(View::Lags),
+        (false, false) if !args.x.is_empty() => return Ok(View::Pair),
+        (true, true) => "--plot of --all-pairs draws one lag: name one pair by --x and --y to see all",
+        (true, false) if args.lag.iter().any(|&lag| lag > 0) => {
+            "--plot of --all-pairs is for columns at the same time: leave out --lag"
+        }
+        _ => return Ok(View::Matrix),
     };
     Err(Error::Usage(message.to_owned()))
 }

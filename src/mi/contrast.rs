@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::bounds::{Objective, infonce};
-use super::fit::{Fit, Model, fit};
+use super::fit::{Fit, Model, Training, fit, training};
 use super::prepare::{Prepared, gather, prepare, tied};
 use super::scorer::{CriticKind, Scorer};
 use super::{
@@ -93,16 +93,27 @@ impl Model for Trainee {
 }
 
 impl Contrast {
-    /// The row.
-    pub(super) fn row(&self, samples: &Samples, protocol: Protocol, seeds: &Seeds) -> Result<Estimate, MiError> {
-        let data = prepare(samples, seeds)?;
-        let mut model = Trainee {
+    fn trainee(&self, data: &Prepared) -> Trainee {
+        Trainee {
             scorer: Scorer::new(self.critic, data.x_width, data.y_width),
             objective: self.objective,
             negatives: self.critic.negatives(),
             grad_positive: Vec::new(),
             grad_negative: Vec::new(),
-        };
+        }
+    }
+
+    /// The training of the critic.
+    pub(super) fn training(&self, samples: &Samples, seeds: &Seeds) -> Option<Training> {
+        let data = prepare(samples, seeds).ok()?;
+        let score = if self.objective == Objective::JensenShannon { "2·JSD" } else { "bound, nats" };
+        training(&mut self.trainee(&data), score, &data, seeds)
+    }
+
+    /// The row.
+    pub(super) fn row(&self, samples: &Samples, protocol: Protocol, seeds: &Seeds) -> Result<Estimate, MiError> {
+        let data = prepare(samples, seeds)?;
+        let mut model = self.trainee(&data);
         let diverged = || MiError::Diverged { columns: format!("{} and {}", samples.labels.x, samples.labels.y) };
         let Fit { params, steps, .. } = fit(&mut model, &data, seeds).ok_or_else(diverged)?;
         let held_out = data.train.len().min(data.test.len());

@@ -21,6 +21,7 @@ mod counts;
 pub mod critic;
 mod discrete;
 mod estimate;
+mod extrapolate;
 mod fit;
 mod gaussian;
 mod gcmi;
@@ -50,12 +51,14 @@ mod tasks;
 
 pub use calibrate::{Calibrated, Drawn, calibrate, calibrated};
 pub use estimate::{Estimate, Kind, Unit, is_estimates, to_csv, to_json, to_parquet};
+pub use extrapolate::{DIVISIONS, Extrapolated, PartValue, extrapolated, part_value};
+pub use fit::Training;
 pub use interval::{Interval, block_interval};
 pub use jsd::certified;
 pub use negatives::{all_others, derangements};
 pub use neighbours::ksg1_value;
 pub use null::{p_value, permuted_rows};
-pub use run::{Job, JobResult, Named, Plan, in_order, run, run_each};
+pub use run::{Job, JobResult, Named, Plan, in_order, job_seeds, run, run_each};
 pub use tasks::{TASKS, Task};
 
 use crate::registry::{Entry, RegistryError, Spec};
@@ -95,6 +98,12 @@ pub trait Estimator: Send + Sync {
     /// # Errors
     /// [`MiError`] when the samples cannot carry the estimate.
     fn estimate(&self, samples: &Samples, protocol: &Protocol, seeds: &Seeds) -> Result<Vec<Estimate>, MiError>;
+
+    /// The training behind [`Self::estimate`] with the same seeds, looked at, where there is one and the samples can
+    /// carry it.
+    fn training(&self, _samples: &Samples, _seeds: &Seeds) -> Option<Training> {
+        None
+    }
 
     /// Whether it knows what to do with columns of words.
     fn takes_words(&self) -> bool {

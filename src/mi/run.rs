@@ -54,7 +54,6 @@ pub fn run(samples: &[Samples], plan: &Plan, done: &(dyn Fn() + Sync)) -> Vec<Jo
 /// As [`run()`], but hands out each result, with its place among all, as soon as it is there; once `stop` is raised, no
 /// job is started.
 pub fn run_each(samples: &[Samples], plan: &Plan, stop: &AtomicBool, tell: &(dyn Fn(usize, JobResult) + Sync)) {
-    let seeds = Seeds::new(plan.seed).child("estimate-mi");
     let jobs: Vec<(&Samples, &Named)> =
         samples.iter().flat_map(|s| plan.estimators.iter().map(move |e| (s, e))).collect();
     jobs.par_iter().enumerate().for_each(|(place, &(samples, (name, estimator)))| {
@@ -62,7 +61,7 @@ pub fn run_each(samples: &[Samples], plan: &Plan, stop: &AtomicBool, tell: &(dyn
             return;
         }
         let labels = samples.labels.clone();
-        let seeds = job_seeds(&seeds, &labels, name);
+        let seeds = job_seeds(plan.seed, &labels, name);
         let rows = fits(samples, &**estimator).and_then(|()| estimator.estimate(samples, &plan.protocol, &seeds));
         tell(place, JobResult { job: Job { estimator: name.clone(), labels }, rows });
     });
@@ -78,8 +77,9 @@ pub fn in_order(mut results: Vec<(usize, JobResult)>, plan: &Plan) -> Vec<JobRes
     results.into_iter().map(|(_, result)| result).collect()
 }
 
-/// What a job draws from, below the node of the command.
-fn job_seeds(command: &Seeds, labels: &SampleLabels, estimator: &str) -> Seeds {
+/// What a job draws from.
+pub fn job_seeds(seed: u64, labels: &SampleLabels, estimator: &str) -> Seeds {
+    let command = Seeds::new(seed).child("estimate-mi");
     command.child(&format!("{}/{}/{:?}", labels.x, labels.y, labels.delivered)).child(estimator)
 }
 

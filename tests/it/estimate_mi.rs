@@ -178,7 +178,6 @@ fn lags_patterns_and_all_pairs_of_any_separator() {
         (2, &["--x", "obs_a", "--y", "y", "--lag", "5..2"], "expected 3, 0,1,5 or 0..10"),
         (1, &["--x", "obs_a", "--y", "y", "--lag", "1"], "no pair 1 rows apart: the longest episode has 1 rows"),
         (1, &["--all-pairs", "--x", "y"], "--all-pairs needs two columns of numbers or words, found 1"),
-        (2, &["--x", "obs_a", "--y", "y", "--plot", "x.svg"], "--plot draws a matrix: give --all-pairs, or a store"),
         (2, &["--all-pairs", "--plot", "x.pdf"], "expected a name that ends in .svg or .png"),
     ] {
         let (found, out, err) = run(&[&[table.as_str()], args].concat());
@@ -247,12 +246,47 @@ fn a_picture_never_takes_the_results_away() {
     assert!(code == 1 && out.contains("a ; b") && err.contains("could not create the directory"), "{code}: {out}{err}");
     // one cell would stand for several lags
     for (more, message) in [
-        (&["--lag", "0,1", "--time", "t"][..], "--plot draws one lag"),
+        (&["--lag", "0,1", "--time", "t"][..], "--plot of --all-pairs draws one lag: name one pair"),
         (&["--lag", "1", "--time", "t"], "--plot of --all-pairs is for columns at the same time"),
     ] {
         let (code, out, err) = run(&[&args[..], more, &["--plot", &at("lags.svg")]].concat());
         assert!(code == 2 && out.is_empty() && err.contains(message), "{code}: {err}");
     }
+}
+
+#[test]
+fn a_pair_and_lags_have_pictures_with_names_escaped_and_the_values_stay_the_same() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut rng = ccmarl::rng::Seeds::new(4).stream("pair");
+    let mut text = "t,<b>&a,y,word\n".to_owned();
+    for t in 0..300 {
+        let x = ccmarl::rng::normal(&mut rng);
+        writeln!(text, "{t},{x},{},{}", x + ccmarl::rng::normal(&mut rng), ["u", "<v>"][t % 2]).unwrap();
+    }
+    let table = write(dir.path(), "pair.csv", &text);
+    let at = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let base = [table.as_str(), "--x", "<b>&a", "--y", "y", "--time", "t", "--permutations", "9", "--format", "json"];
+    let pair = [&base[..], &["--estimator", "infonce,gaussian,club"]].concat();
+    let (_, plain, _) = run(&pair);
+    for name in ["pair.svg", "pair.png"] {
+        let (code, out, err) = run(&[&pair[..], &["--plot", &at(name)]].concat());
+        assert_eq!((code, &out), (0, &plain), "{err}");
+        assert!(err.contains("drew 300 of 300 samples and their estimates: "), "{err}");
+    }
+    let svg = std::fs::read_to_string(at("pair.svg")).unwrap();
+    assert!(svg.contains("&lt;b&gt;&amp;a") && !svg.contains("<b>"), "escaped");
+    for words in ["training of infonce", "training of club", "infonce by number of samples", "300", "75", "gaussian"] {
+        assert!(svg.contains(&format!("\n{words}\n")), "{words}");
+    }
+    let (code, _, err) = run(&[&base[..], &["--lag", "0..3", "--estimator", "gaussian", "--plot", &at("lag.svg")]].concat());
+    assert!(code == 0 && err.contains("drew 1 lines over lags: "), "{err}");
+    assert!(std::fs::read_to_string(at("lag.svg")).unwrap().contains("&lt;b&gt;&amp;a ; y by lag"));
+    // what cannot take the samples is left out of the picture, as of the rows
+    let words = [table.as_str(), "--x", "word", "--y", "y", "--permutations", "0", "--estimator", "infonce,discrete"];
+    let (code, _, err) = run(&[&words[..], &["--plot", &at("word.svg")]].concat());
+    let svg = std::fs::read_to_string(at("word.svg")).unwrap();
+    assert!(code == 0 && svg.contains("discrete by number of samples") && !svg.contains("training of"), "{err}");
+    assert!(svg.contains("word (words in order, spread)"));
 }
 
 #[test]
