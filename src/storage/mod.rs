@@ -26,7 +26,7 @@ use tally::Tally;
 use verify::Findings;
 
 pub use convert::convert;
-pub use form::table_form;
+pub use form::{TableForm, table_form};
 pub use lock::Owner;
 pub use names::refuse_within_store;
 pub use recover::{Recovered, recover};
