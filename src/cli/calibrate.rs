@@ -1,13 +1,14 @@
 //! `ccmarl calibrate`: estimators on forty tasks of known information.
 
-use anyhow::Context as _;
 use serde::Serialize;
 
-use super::estimate_mi::{decimals, named};
+use super::estimate_mi::named;
+use super::estimates::decimals;
+use super::jobs::{Gathered, gather};
 use super::ui::{self, Format};
 use super::{Outcome, estimate_mi};
 use crate::Error;
-use crate::mi::{Calibrated, Kind, Plan, Protocol, TASKS, Task, calibrate};
+use crate::mi::{Calibrated, Kind, Plan, Protocol, TASKS, Task, calibrate, calibrated};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -15,6 +16,7 @@ Examples:
   ccmarl calibrate --estimator ksg,gcmi,infonce --n 2000 --seeds 3 --task student,spiral
   ccmarl calibrate --format json
 
+Interrupted (Ctrl-C), it shows what the finished draws say and exits 4.
 The tasks are those of Czyz et al. 2023 (arXiv 2306.11078). error: mean over the seeds of |value - truth|, nats.
 covers: share of the 95 % intervals that hold the truth (a bound's interval is about its own expectation).
 right: tasks whose mean is within a tenth of the truth, or 0.03 nats.";
@@ -75,18 +77,25 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         return Err(Error::Usage(format!("no task contains {}; the tasks are {ids}", args.task.join(" or "))).into());
     }
     let plan = Plan { estimators: named(&args.estimator)?, protocol: Protocol { permutations: 0 }, seed: args.seed };
-    let threads = usize::from(args.threads);
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().context("could not start threads")?;
-    let bar = ui::progress((tasks.len() * args.seeds as usize) as u64, "drawing and estimating");
-    let rows = pool.install(|| calibrate(&tasks, &plan, args.n as usize, u64::from(args.seeds), &|| bar.inc(1)));
-    bar.finish_and_clear();
+    let (n, seeds, total) = (args.n as usize, u64::from(args.seeds), tasks.len() * args.seeds as usize);
+    let own_tasks = tasks.clone();
+    let Gathered { told, interrupted } = gather(args.threads, total, "drawing and estimating", move |stop, tell| {
+        calibrate(&own_tasks, &plan, n, seeds, stop, tell);
+    })?;
+    if interrupted {
+        ui::say(&format!("interrupted: {} of {total} draws are finished, and only these count", told.len()));
+        if told.is_empty() {
+            return Ok(Outcome::Interrupted);
+        }
+    }
+    let rows = calibrated(&tasks, told);
     anyhow::ensure!(!rows.is_empty(), "no estimator gave a value in nats: give --n more samples");
     let total = totals(&rows);
     match args.format {
         Format::Json => ui::print_json(&Result { tasks: rows, total })?,
         Format::Table => print(&rows, &total)?,
     }
-    Ok(Outcome::Done)
+    Ok(if interrupted { Outcome::Interrupted } else { Outcome::Done })
 }
 
 fn totals(rows: &[Calibrated]) -> Vec<Total> {

@@ -1,6 +1,7 @@
 //! Estimators on tasks of known information: how far off, and how often the interval holds the truth.
 
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -42,29 +43,47 @@ impl Calibrated {
 /// The rows of one estimator by their names, in the order of first appearance.
 type ByName = Vec<(String, Vec<Estimate>)>;
 
-/// Runs every estimator of the plan on `seeds` draws of `n` samples of every task, in parallel; `done` is called after each
-/// draw. Rows come by task and then by estimator; values on another scale than nats are left out.
-pub fn calibrate(tasks: &[Task], plan: &Plan, n: usize, seeds: u64, done: &(dyn Fn() + Sync)) -> Vec<Calibrated> {
+/// The rows of all estimators on one draw of one task, each with its estimator's place in the plan.
+pub struct Drawn {
+    task: usize,
+    seed: u64,
+    rows: Vec<(usize, Estimate)>,
+}
+
+/// Runs every estimator of the plan on `seeds` draws of `n` samples of every task, in parallel, and hands out each draw
+/// as soon as it is there; once `stop` is raised, no draw is started.
+pub fn calibrate(
+    tasks: &[Task],
+    plan: &Plan,
+    n: usize,
+    seeds: u64,
+    stop: &AtomicBool,
+    tell: &(dyn Fn(Drawn) + Sync),
+) {
     let root = Seeds::new(plan.seed).child("calibrate");
     let draws: Vec<(usize, u64)> = (0..tasks.len()).flat_map(|t| (0..seeds).map(move |s| (t, s))).collect();
-    let run = |&(t, seed): &(usize, u64)| {
-        let own = root.child(tasks[t].id).indexed("seed", seed);
-        let samples = tasks[t].samples(n, &mut own.stream("samples"));
+    draws.par_iter().filter(|_| !stop.load(Ordering::SeqCst)).for_each(|&(task, seed)| {
+        let own = root.child(tasks[task].id).indexed("seed", seed);
+        let samples = tasks[task].samples(n, &mut own.stream("samples"));
         let of = |(place, (name, estimator)): (usize, &super::Named)| {
             let rows = estimator.estimate(&samples, &plan.protocol, &own.child(name)).unwrap_or_default();
             rows.into_iter().map(move |row| (place, row))
         };
-        let rows: Vec<(usize, Estimate)> = plan.estimators.iter().enumerate().flat_map(of).collect();
-        done();
-        (t, rows)
-    };
-    let results: Vec<(usize, Vec<(usize, Estimate)>)> = draws.par_iter().map(run).collect();
+        let rows = plan.estimators.iter().enumerate().flat_map(of).collect();
+        tell(Drawn { task, seed, rows });
+    });
+}
+
+/// What draws say about estimators, by task and then by estimator; some draws may be missing. Values on another scale
+/// than nats are left out.
+pub fn calibrated(tasks: &[Task], mut draws: Vec<Drawn>) -> Vec<Calibrated> {
+    draws.sort_by_key(|draw| (draw.task, draw.seed));
     // by task, by estimator as asked, and by its rows as they come
     let mut groups: BTreeMap<(usize, usize), ByName> = BTreeMap::new();
-    for (t, rows) in results {
+    for Drawn { task, rows, .. } in draws {
         let finite = |r: &(usize, Estimate)| r.1.unit == Unit::Nats && r.1.value.is_finite();
         for (place, row) in rows.into_iter().filter(finite) {
-            let group = groups.entry((t, place)).or_default();
+            let group = groups.entry((task, place)).or_default();
             match group.iter().position(|(name, _)| *name == row.estimator) {
                 Some(at) => group[at].1.push(row),
                 None => group.push((row.estimator.clone(), vec![row])),
@@ -102,16 +121,22 @@ mod tests {
     use crate::mi::TASKS;
     use crate::mi::run::tests::plan;
 
+    fn all(tasks: &[Task], plan: &Plan, n: usize, seeds: u64) -> Vec<Calibrated> {
+        let told = std::sync::Mutex::new(Vec::new());
+        calibrate(tasks, plan, n, seeds, &AtomicBool::new(false), &|draw| told.lock().unwrap().push(draw));
+        calibrated(tasks, told.into_inner().unwrap())
+    }
+
     #[test]
     fn exact_estimators_are_right_on_their_own_tasks_and_seeds_and_threads_do_not_mix() {
         let tasks: Vec<Task> = TASKS.iter().filter(|t| t.id.starts_with("multinormal-dense-3")).copied().collect();
-        let found = calibrate(&tasks, &plan(&["gaussian", "ksg1"], 0, 1), 2000, 10, &|| ());
+        let found = all(&tasks, &plan(&["gaussian", "ksg1"], 0, 1), 2000, 10);
         assert_eq!(found.iter().map(|c| c.estimator.as_str()).collect::<Vec<_>>(), ["gaussian", "ksg1:3"]);
         let gaussian = &found[0];
         assert!(gaussian.is_right() && gaussian.error < 0.03 && gaussian.covered.unwrap() >= 0.7, "{gaussian:?}");
         assert!(gaussian.seeds == 10 && gaussian.deviation.unwrap() < 0.04, "{gaussian:?}");
         let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-        let alone = pool.install(|| calibrate(&tasks, &plan(&["gaussian"], 0, 1), 2000, 10, &|| ()));
+        let alone = pool.install(|| all(&tasks, &plan(&["gaussian"], 0, 1), 2000, 10));
         assert_eq!(alone[0], found[0]);
     }
 
@@ -133,7 +158,7 @@ mod tests {
         }
         let mut plan = plan(&["gaussian"], 0, 1);
         plan.estimators.insert(0, ("moody".to_owned(), Box::new(Moody)));
-        let found = calibrate(&TASKS[..1], &plan, 50, 20, &|| ());
+        let found = all(&TASKS[..1], &plan, 50, 20);
         let names: Vec<(&str, bool)> = found.iter().map(|c| (c.estimator.as_str(), c.seeds == 20)).collect();
         assert_eq!(names, [("moody", false), ("gaussian", true)]);
     }

@@ -49,14 +49,14 @@ pub(crate) mod shifted;
 mod smile;
 mod tasks;
 
-pub use calibrate::{Calibrated, calibrate};
+pub use calibrate::{Calibrated, Drawn, calibrate, calibrated};
 pub use estimate::{Estimate, Kind, Unit, is_estimates, to_csv, to_json, to_parquet};
 pub use interval::{Interval, block_interval};
 pub use jsd::certified;
 pub use negatives::{all_others, derangements};
 pub use neighbours::ksg1_value;
 pub use null::{p_value, permuted_rows};
-pub use run::{Job, JobResult, Named, Plan, run};
+pub use run::{Job, JobResult, Named, Plan, in_order, run, run_each};
 pub use tasks::{TASKS, Task};
 
 use crate::registry::{Entry, RegistryError, Spec};
