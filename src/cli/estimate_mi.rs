@@ -70,7 +70,7 @@ pub(super) struct Args {
     /// Rows from x to y, never across the edge of an episode: 3, or 0,1,5, or 0..10 (both ends included)
     #[arg(long, value_name = "LAGS", default_value = "0", value_parser = lags)]
     lag: Lags,
-    /// Table: columns of z; x and y are compared given z (gaussian, gcmi, ksg1, ksg-mixed, discrete)
+    /// Table: columns of z; x and y are compared given z (auto, gaussian, gcmi, ksg1, ksg-mixed, discrete, infonce)
     #[arg(long, value_name = "COLUMNS", value_delimiter = ',', requires = "table")]
     given: Vec<String>,
     /// Table: rows with the same value in this column are one episode

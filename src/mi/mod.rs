@@ -7,7 +7,7 @@
 //! rest of the room is protocol: `prepare` (standardised, split by episode), `fit` (training, stopped on validation),
 //! `interval` (episodes as blocks), `null` (whole episodes permuted), `part` (parts of the samples by whole episodes),
 //! `run` (all jobs in parallel); and what several share: `critic`,
-//! `scorer`, `bounds` and `contrast` (trained critics), `linear` (covariances), `given` (z), `knn` and `neighbours`, `counts`.
+//! `scorer`, `bounds`, `contrast` and `contrast_given` (trained critics), `linear` (covariances), `given` (z), `knn` and `neighbours`, `counts`.
 
 pub(crate) mod all_pairs;
 mod auto;
@@ -17,6 +17,7 @@ mod club;
 mod club_sample;
 pub mod conditional;
 mod contrast;
+mod contrast_given;
 mod counts;
 pub mod critic;
 mod discrete;
