@@ -73,6 +73,17 @@ pub(super) fn say(text: &str) {
     }
 }
 
+/// Says when something unfinished lies beside a store.
+pub(super) fn say_left_beside(store: &std::path::Path) {
+    if let Some(left) = crate::storage::left_beside(store) {
+        let (left, store) = (left.display(), store.display());
+        say(&format!(
+            "note: beside it lies what did not finish; `ccmarl recover --force {store}` puts its whole episodes in place of \
+             this store: {left}"
+        ));
+    }
+}
+
 /// A progress bar with rate and ETA on stderr; silent when stderr is no terminal.
 pub(super) fn progress(total: u64, what: &'static str) -> ProgressBar {
     let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(8));

@@ -52,8 +52,11 @@ pub(super) fn render(how: &Lines, data: &Data, curves: &[Curve], target: Target<
     }
     let shown = data.series.iter().enumerate().filter(|(_, s)| curves.iter().any(|c| c.series == **s));
     let colors = shown.map(|(i, s)| (s.clone(), style::color(i))).collect();
-    let (x, y) =
-        if how.diagonal { (0.0..1.0, 0.0..1.0) } else { (style::axis(left, right), 1.06 * bottom..(1.06 * top).max(1e-3)) };
+    let (x, y) = if how.diagonal {
+        (0.0..1.0, 0.0..1.0)
+    } else {
+        (style::axis(left, right), 1.06 * bottom..(1.06 * top).max(1e-3))
+    };
     let (curves, y) = if how.log { logarithms(curves, y.end) } else { (curves.to_vec(), y) };
     style::render(&Figure { how, data, curves, colors, x, y }, target)
 }

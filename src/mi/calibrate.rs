@@ -52,14 +52,7 @@ pub struct Drawn {
 
 /// Runs every estimator of the plan on `seeds` draws of `n` samples of every task, in parallel, and hands out each draw
 /// as soon as it is there; once `stop` is raised, no draw is started.
-pub fn calibrate(
-    tasks: &[Task],
-    plan: &Plan,
-    n: usize,
-    seeds: u64,
-    stop: &AtomicBool,
-    tell: &(dyn Fn(Drawn) + Sync),
-) {
+pub fn calibrate(tasks: &[Task], plan: &Plan, n: usize, seeds: u64, stop: &AtomicBool, tell: &(dyn Fn(Drawn) + Sync)) {
     let root = Seeds::new(plan.seed).child("calibrate");
     let draws: Vec<(usize, u64)> = (0..tasks.len()).flat_map(|t| (0..seeds).map(move |s| (t, s))).collect();
     draws.par_iter().filter(|_| !stop.load(Ordering::SeqCst)).for_each(|&(task, seed)| {

@@ -114,9 +114,8 @@ mod tests {
         let mut samples = linear_samples(0.5, 400, 1, 6);
         samples.starts = (0..=40).map(|e| 10 * e).collect::<Vec<_>>().into();
         let plan = plan(&["gaussian"], 0, 1);
-        let of = |samples: &Samples, part| {
-            part_value(&*plan.estimators[0].1, samples, 2, part, &Seeds::new(1)).unwrap()
-        };
+        let of =
+            |samples: &Samples, part| part_value(&*plan.estimators[0].1, samples, 2, part, &Seeds::new(1)).unwrap();
         assert_eq!(of(&samples, 0).n + of(&samples, 1).n, 400);
         let shuffled = of(&samples, 0).value;
         samples.exchange = Exchange::Shift;

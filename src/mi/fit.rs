@@ -170,13 +170,13 @@ mod tests {
     #[test]
     fn looking_at_the_training_changes_nothing_and_the_chosen_look_is_the_best() {
         let seeds = Seeds::new(3);
-        let data = prepare(&linear_samples(0.8, 2000, 1, 4), &seeds).unwrap();
+        let data = prepare(&linear_samples(0.4, 2000, 1, 4), &seeds).unwrap();
         let plain = fit(&mut Line, &data, &seeds).unwrap();
         let watched = training(&mut Line, "score", &data, &seeds).unwrap();
         assert_eq!((watched.chosen, watched.looks[0].0), (plain.steps, 0));
         let best = watched.looks.iter().max_by(|a, b| a.2.total_cmp(&b.2)).unwrap();
         assert_eq!((best.0, best.2), (plain.steps, plain.score));
         // 1 − ρ² of the variance stays
-        assert!((plain.params[0] - 0.8).abs() < 0.05 && (best.1 + 0.36).abs() < 0.05, "{best:?}");
+        assert!((plain.params[0] - 0.4).abs() < 0.1 && (best.1 + 0.84).abs() < 0.12, "{best:?}");
     }
 }

@@ -21,10 +21,12 @@ mod contrast_given;
 mod counts;
 pub mod critic;
 mod discrete;
+mod discrete_pass;
 mod estimate;
 mod extrapolate;
 mod fit;
 mod gaussian;
+mod gaussian_pass;
 mod gcmi;
 mod given;
 mod infonce;
@@ -42,6 +44,7 @@ mod negatives;
 mod neighbours;
 mod null;
 mod nwj;
+mod one_pass;
 mod part;
 mod prepare;
 mod run;
@@ -59,7 +62,8 @@ pub use jsd::certified;
 pub use negatives::{all_others, derangements};
 pub use neighbours::ksg1_value;
 pub use null::{p_value, permuted_rows};
-pub use run::{Job, JobResult, Named, Plan, in_order, job_seeds, run, run_each};
+pub use one_pass::OnePass;
+pub use run::{Job, JobResult, Named, Plan, fits, in_order, job_seeds, run, run_each};
 pub use tasks::{TASKS, Task};
 
 use crate::registry::{Entry, RegistryError, Spec};
@@ -87,7 +91,7 @@ pub const ESTIMATORS: &[Entry<Build>] = &[
 ];
 
 /// What an entry of `warnings` begins with that explains and does not warn.
-pub const NOTE: &str = "note: ";
+pub const NOTE: &str = crate::schema::NOTE;
 
 /// Makes an estimator from its parameters.
 pub type Build = fn(&Spec) -> Result<Box<dyn Estimator>, RegistryError>;
@@ -103,6 +107,11 @@ pub trait Estimator: Send + Sync {
     /// The training behind [`Self::estimate`] with the same seeds, looked at, where there is one and the samples can
     /// carry it.
     fn training(&self, _samples: &Samples, _seeds: &Seeds) -> Option<Training> {
+        None
+    }
+
+    /// The same estimate in one pass over samples that stand each for itself, where the estimator can do that.
+    fn one_pass(&self) -> Option<Box<dyn OnePass>> {
         None
     }
 
@@ -171,6 +180,17 @@ pub enum MiError {
     Words {
         /// Which columns.
         columns: String,
+    },
+    /// Too many categories to count.
+    #[error(
+        "more than {limit} different pairs of categories in the first {rows} rows: such columns are not discrete; take \
+         gaussian, or give --sample N"
+    )]
+    TooManyCategories {
+        /// Most pairs.
+        limit: usize,
+        /// Rows looked at.
+        rows: usize,
     },
     /// z, and an estimator that has no use for it.
     #[error("it estimates nothing given z: leave out --given, or take one of {}", taking(|e| e.takes_given()))]

@@ -48,7 +48,8 @@ pub fn run(samples: &[Samples], plan: &Plan, done: &(dyn Fn() + Sync)) -> Vec<Jo
         results.lock().unwrap_or_else(std::sync::PoisonError::into_inner).push((place, result));
         done();
     });
-    in_order(results.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner), plan)
+    let results = results.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
+    in_order(results, plan.estimators.len())
 }
 
 /// As [`run()`], but hands out each result, with its place among all, as soon as it is there; once `stop` is raised, no
@@ -68,8 +69,9 @@ pub fn run_each(samples: &[Samples], plan: &Plan, stop: &AtomicBool, tell: &(dyn
 }
 
 /// Results by their places among all jobs, rows of the same samples compared with each other; some may be missing.
-pub fn in_order(mut results: Vec<(usize, JobResult)>, plan: &Plan) -> Vec<JobResult> {
-    let per_samples = plan.estimators.len().max(1);
+/// `estimators` is the number of them that run on the same samples.
+pub fn in_order(mut results: Vec<(usize, JobResult)>, estimators: usize) -> Vec<JobResult> {
+    let per_samples = estimators.max(1);
     results.sort_by_key(|(place, _)| *place);
     for same_samples in results.chunk_by_mut(|a, b| a.0 / per_samples == b.0 / per_samples) {
         compare(same_samples);
@@ -84,7 +86,10 @@ pub fn job_seeds(seed: u64, labels: &SampleLabels, estimator: &str) -> Seeds {
 }
 
 /// Whether the estimator can take the samples at all.
-fn fits(samples: &Samples, estimator: &dyn Estimator) -> Result<(), MiError> {
+///
+/// # Errors
+/// [`MiError::Given`], [`MiError::Words`].
+pub fn fits(samples: &Samples, estimator: &dyn Estimator) -> Result<(), MiError> {
     if samples.z.is_some() && !estimator.takes_given() {
         return Err(MiError::Given);
     }
@@ -191,8 +196,7 @@ pub(super) mod tests {
         let other = upper.clone();
         let mut lower = Estimate::new("jsd-nwj", &labels, 0.5, Unit::Nats, Kind::LowerBound, 9);
         lower.interval_low = Some(0.4);
-        let plan = plan(&["club", "jsd"], 0, 1);
-        let results = in_order(vec![(3, job(lower)), (0, job(other)), (2, job(upper))], &plan);
+        let results = in_order(vec![(3, job(lower)), (0, job(other)), (2, job(upper))], 2);
         assert_eq!(results[0].rows.as_ref().unwrap()[0].warnings, [""; 0], "other samples");
         let warnings = &results[1].rows.as_ref().unwrap()[0].warnings;
         assert_eq!(*warnings, ["below the lower bound jsd-nwj (0.400): q fits badly, this is no upper bound"]);
@@ -210,7 +214,7 @@ pub(super) mod tests {
                 stop.store(told.lock().unwrap().len() == 3, Ordering::SeqCst);
             });
         });
-        let told = in_order(told.into_inner().unwrap(), &plan);
+        let told = in_order(told.into_inner().unwrap(), 1);
         assert_eq!(told.len(), 3);
         let whole = run(&sets, &plan, &|| ());
         let value = |r: &JobResult| r.rows.as_ref().unwrap()[0].value;

@@ -114,6 +114,19 @@ pub enum PairsError {
         /// File.
         path: PathBuf,
     },
+    /// A column of a table that is read in pieces.
+    #[error(
+        "column {name:?} holds both numbers and words, seen from row {row} on: a table this large is read in pieces, and a \
+         column must hold one of them: clean it, or give --memory more: {}", path.display()
+    )]
+    Mixed {
+        /// Column.
+        name: String,
+        /// 1-based row of data at which the piece begins.
+        row: u64,
+        /// File.
+        path: PathBuf,
+    },
     /// A number whose square is infinite.
     #[error("column {name:?}, row {row}: infinite or over 1e150; remove the row or rescale the column: {}", path.display())]
     Infinite {

@@ -50,9 +50,7 @@ pub(super) fn pieces(
             let (name, estimator) = &own_plan.estimators[at];
             let seeds = mi::job_seeds(own_plan.seed, &samples.labels, name);
             tell(match part {
-                Some((division, part)) => {
-                    Piece::Part(mi::part_value(&**estimator, samples, division, part, &seeds))
-                }
+                Some((division, part)) => Piece::Part(mi::part_value(&**estimator, samples, division, part, &seeds)),
                 None => Piece::Training(at, estimator.training(samples, &seeds)),
             });
         });

@@ -21,6 +21,39 @@ pub(super) trait TableFile {
 
     /// Columns that it has, each name once.
     fn read(&self, columns: &[&str]) -> Result<DataFrame, PairsError>;
+
+    /// Bytes that these columns take in memory, about; `None` where only reading tells.
+    fn size(&self, _columns: &[&str]) -> Result<Option<u64>, PairsError> {
+        Ok(None)
+    }
+
+    /// Rows, where the file says it.
+    fn rows(&self) -> Result<Option<u64>, PairsError> {
+        Ok(None)
+    }
+
+    /// The same file as several smaller ones, whose rows follow each other; `None` for a form that cannot be cut.
+    fn pieces(&self, _size: PieceSize) -> Result<Option<Pieces<'_>>, PairsError> {
+        Ok(None)
+    }
+}
+
+/// Pieces of a file, one after the other.
+pub(super) type Pieces<'a> = Box<dyn Iterator<Item = Result<Box<dyn TableFile + 'a>, PairsError>> + 'a>;
+
+/// How large pieces may be, which changes no result.
+#[derive(Clone, Copy, Debug)]
+pub struct PieceSize {
+    /// Rows, where they are known before they are read.
+    pub rows: usize,
+    /// Bytes of text.
+    pub bytes: usize,
+}
+
+impl Default for PieceSize {
+    fn default() -> Self {
+        Self { rows: 1 << 19, bytes: 32 << 20 }
+    }
 }
 
 /// Opens a file and runs what touches its data.

@@ -1,13 +1,16 @@
 //! Samples from named columns of anybody's table.
 //!
-//! [`form`] reads a file, whatever its form; [`names`] says which columns are meant; [`numbers`] makes numbers of them;
+//! [`form`] reads a file, whatever its form, whole or in pieces; [`pass`] goes over the pieces once, [`sample`] draws rows; [`names`] says which columns are meant; [`numbers`] makes numbers of them;
 //! [`order`] puts rows into episodes.
 
 mod form;
+mod lines;
 mod names;
 mod numbers;
 mod order;
 mod parquet;
+mod pass;
+mod sample;
 mod text;
 
 use std::path::Path;
@@ -15,13 +18,17 @@ use std::sync::Arc;
 
 use polars::prelude::{DataFrame, DataType};
 
-use self::form::{caught, guarded};
+pub use self::form::PieceSize;
+use self::form::{TableFile, caught, guarded};
 use self::names::expanded;
 use self::numbers::{is_numeric, numbers};
 use self::order::{Order, episodes, texts};
+pub use self::pass::{Passed, Progress, pass, size};
+use self::sample::Drawn;
+pub use self::sample::Sample;
 use super::PairsError;
 use crate::io::IoError;
-use crate::schema::{Columns, Exchange, SampleLabels, Samples};
+use crate::schema::{Columns, Exchange, NOTE, SampleLabels, Samples};
 use crate::storage::{TableForm, table_form};
 
 /// Which columns to read, and what an episode is. `regex:PATTERN` stands for all columns whose name it matches.
@@ -37,6 +44,8 @@ pub struct TableOptions {
     pub group: Option<String>,
     /// Order of the rows within an episode; without `group` all rows are one series.
     pub time: Option<String>,
+    /// Rows to draw, if not all are to be used.
+    pub sample: Option<Sample>,
 }
 
 /// Whether a path is a rollout store: a directory, an `.mcap` file, or Parquet with the key `ccmarl.manifest`.
@@ -61,8 +70,10 @@ pub fn is_store(path: &Path) -> Result<bool, PairsError> {
 pub fn table(path: &Path, options: &TableOptions) -> Result<Samples, PairsError> {
     caught(path, |file| {
         let options = expanded(file, path, options)?;
-        let frame = form::wanted(file, path, &wanted(&options))?;
-        samples(&frame, path, &options)
+        let (frame, note) = frame(file, path, &options)?;
+        let mut set = samples(&frame, path, &options)?;
+        set.notes.extend(note);
+        Ok(set)
     })
 }
 
@@ -79,7 +90,7 @@ pub fn all_pairs(path: &Path, options: &TableOptions) -> Result<(Vec<Samples>, V
         if !chosen {
             options.x = file.names()?;
         }
-        let frame = form::wanted(file, path, &wanted(&options))?;
+        let (frame, note) = frame(file, path, &options)?;
         let others: Vec<&String> = options.given.iter().chain(&options.group).chain(&options.time).collect();
         let usable = |name: &&String| {
             let kind = frame.column(name).map(|c| c.dtype().clone());
@@ -97,7 +108,10 @@ pub fn all_pairs(path: &Path, options: &TableOptions) -> Result<(Vec<Samples>, V
         for (i, j) in (0..full.len()).flat_map(|i| (i + 1..full.len()).map(move |j| (i, j))) {
             let (x, y) = (vec![full[i].clone()], vec![full[j].clone()]);
             match samples(&frame, path, &TableOptions { x, y, ..options.clone() }) {
-                Ok(set) => sets.push(set),
+                Ok(mut set) => {
+                    set.notes.extend(note.clone());
+                    sets.push(set);
+                }
                 Err(error @ PairsError::NoRows { .. }) => {
                     left_out.push(error.to_string());
                     last = Some(error);
@@ -111,6 +125,28 @@ pub fn all_pairs(path: &Path, options: &TableOptions) -> Result<(Vec<Samples>, V
         let columns = full.into_iter().chain(empty).collect::<Vec<_>>().join(", ");
         Err(last.unwrap_or_else(|| PairsError::NoRows { rows: frame.height(), columns, path: path.to_owned() }))
     })
+}
+
+/// The columns that the options name, of all rows or of those that are drawn, and what was not.
+fn frame(file: &dyn TableFile, path: &Path, options: &TableOptions) -> Result<(DataFrame, Option<String>), PairsError> {
+    let columns = wanted(options);
+    let Some(sample) = &options.sample else { return Ok((form::wanted(file, path, &columns)?, None)) };
+    let mut drawn = Drawn::new(sample);
+    let mut add = |piece: &dyn TableFile| -> Result<(), PairsError> {
+        drawn.add(&form::wanted(piece, path, &columns)?).map_err(form::unreadable("table", path))
+    };
+    match file.pieces(PieceSize::default())? {
+        Some(pieces) => pieces.into_iter().try_for_each(|piece| add(&*piece?))?,
+        None => add(file)?,
+    }
+    let (frame, all) = drawn.finish().map_err(form::unreadable("table", path))?;
+    let note = sampled_note(frame.height(), all);
+    Ok((frame, note))
+}
+
+/// What is said of values on a sample.
+fn sampled_note(rows: usize, all: u64) -> Option<String> {
+    (all > rows as u64).then(|| format!("{NOTE}estimated on {rows} of {all} rows, drawn at random"))
 }
 
 /// All columns that the options name.
