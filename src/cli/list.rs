@@ -25,7 +25,7 @@ const KINDS: &[(&str, List)] = &[
     ("policy", |kind| listed(kind, crate::record::POLICIES)),
     ("format", |kind| listed(kind, crate::storage::FORMATS)),
     ("estimator", |kind| listed(kind, crate::mi::ESTIMATORS)),
-    ("algorithm", |kind| listed(kind, crate::algo::ALGORITHMS)),
+    ("algorithm", |kind| listed(kind, algo::ALGORITHMS)),
     ("figure", |kind| listed(kind, crate::figure::FIGURES)),
     ("suite", suites),
     ("channel", channels),
