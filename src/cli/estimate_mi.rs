@@ -10,7 +10,7 @@ use super::args::end_on_signals;
 use super::{Outcome, heatmap, ui};
 use crate::Error;
 use crate::mi::{self, ESTIMATORS, Estimate, Job, JobResult, Kind, Plan, Protocol};
-use crate::pairs::{self, PairsError, TableOptions};
+use crate::pairs::{self, By, Lagging, PairsError, Predicate, TableOptions};
 use crate::registry::{Spec, find};
 use crate::schema::{SampleLabels, Samples};
 use crate::{io, storage};
@@ -27,10 +27,25 @@ Examples:
   ccmarl estimate-mi table.csv --x 'regex:^obs_' --y action --time t --lag 0..10 --estimator ksg
   ccmarl estimate-mi table.csv --x job --y city --estimator discrete --format csv
   ccmarl estimate-mi table.csv --x a --y b --time t --out result.json
+  ccmarl estimate-mi 'data/*.csv' more.feather --x a --y b --group file --estimator gcmi
+  ccmarl estimate-mi table.csv --x a --y b --where \"city <> 'Rome' AND c IS NOT NULL\" --by city
+  ccmarl estimate-mi drive.mcap --x /imu.acceleration.x --y /wheel.speed --time log_time
+  ccmarl estimate-mi data/tag --by sender,step:10 --where 'episode >= 100'
 
 For a store: x is the message that the sender sent, y the action of the receiver at the same step, per ordered link,
 delivered and lost apart. Values are in nats unless the unit says jsd. p: episodes permuted.
-In a CSV an empty cell and NaN are missing. Columns of words are categories: discrete and ksg-mixed take them.
+With --by sender, receiver or none, links are pooled: the rows of an episode stay one episode.
+
+A table is CSV, TSV, Parquet, Arrow IPC (file, stream, Feather 2), NPY (columns c0, c1, …, or the names of fields) or MCAP (columns
+/topic.field.path of JSON and protobuf messages, and log_time; columns of two topics are joined by equal log times).
+Several files: their rows follow each other; the column file says which one a row is of.
+Cells of text: a column is numbers, true/false, dates or words; missing are empty cells, NA, N/A, NaN and null, and in any case of letters
+none and - where the others are numbers or dates. A stray cell among numbers is an error: --words takes the column as it is.
+Dates (2024-01-31, 2024-01-31T12:00:00.5+01:00) are seconds since the first of them. Columns of words are categories: discrete
+and ksg-mixed take them.
+--where: = <> < <= > >=, AND, OR, NOT, BETWEEN, IN (…), IS [NOT] NULL, LIKE, + - * / %, 'text', '2024-01-31' beside dates,
+\"columns with blanks\". A missing cell is NULL, and so is what is divided by zero; / never rounds.
+--by: the group of a row tells the part (row, city = Rome; episode, steps 0–9).
 The rows mean:
   auto           one value: chosen by types, ties, width and size, and by what several estimators say
   jsd            2·JSD of the critic, 0 to 2 ln 2: a lower bound on its own scale, not nats
@@ -49,17 +64,18 @@ The rows mean:
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, group(clap::ArgGroup::new("table").args(["x", "all_pairs"]).multiple(true)))]
 pub(super) struct Args {
-    /// A rollout store (directory, .mcap or .parquet), or with --x and --y any CSV, TSV or Parquet table
-    #[arg(value_name = "PATH", value_hint = ValueHint::AnyPath)]
-    path: PathBuf,
+    /// A rollout store (directory, .mcap or .parquet); or, with --x and --y, tables in CSV, TSV, Parquet, Arrow IPC or NPY:
+    /// one, several, or a quoted pattern ('data/*.csv'), whose rows follow each other
+    #[arg(value_name = "PATH", required = true, value_hint = ValueHint::AnyPath)]
+    paths: Vec<PathBuf>,
     #[arg(long, value_name = "NAMES", value_delimiter = ',', default_value = "jsd,club,gaussian", help = estimators())]
     estimator: Vec<String>,
-    /// Table: columns of x, comma-separated; regex:PATTERN, without a comma, is all columns that it matches
-    #[arg(long, value_name = "COLUMNS", value_delimiter = ',')]
-    x: Vec<String>,
-    /// Table: columns of y, comma-separated
-    #[arg(long, value_name = "COLUMNS", value_delimiter = ',', requires = "x")]
-    y: Vec<String>,
+    /// Table: columns of x, comma-separated, or --x again; regex:PATTERN, commas and all, is every column that it matches
+    #[arg(long, value_name = "COLUMNS", value_parser = columns)]
+    x: Vec<Names>,
+    /// Table: columns of y, as --x
+    #[arg(long, value_name = "COLUMNS", value_parser = columns, requires = "x")]
+    y: Vec<Names>,
     /// Table: every pair of the columns --x, or of all columns
     #[arg(long, conflicts_with = "y")]
     all_pairs: bool,
@@ -67,14 +83,24 @@ pub(super) struct Args {
     #[arg(long, value_name = "LAGS", default_value = "0", value_parser = lags)]
     lag: Lags,
     /// Table: columns of z; x and y are compared given z (gaussian, gcmi, ksg1, ksg-mixed, discrete)
-    #[arg(long, value_name = "COLUMNS", value_delimiter = ',', requires = "table")]
-    given: Vec<String>,
+    #[arg(long, value_name = "COLUMNS", value_parser = columns, requires = "table")]
+    given: Vec<Names>,
     /// Table: rows with the same value in this column are one episode
     #[arg(long, value_name = "COLUMN", requires = "table")]
     group: Option<String>,
     /// Table: column that orders the rows; without --group all rows are one series, cut into blocks
     #[arg(long, value_name = "COLUMN", requires = "table")]
     time: Option<String>,
+    /// Rows to use: an SQL condition over any columns, or over a store's episode, step, sender, receiver, delivered
+    #[arg(long = "where", value_name = "CONDITION")]
+    filter: Option<String>,
+    /// Table: one estimate per value of these columns. Store: sender, receiver, both (the default), none: all others are
+    /// pooled; step:N apart from that: N steps of the episode at a time
+    #[arg(long, value_name = "COLUMNS", value_delimiter = ',')]
+    by: Vec<String>,
+    /// Table: columns whose values are words, even if they look like numbers
+    #[arg(long, value_name = "COLUMNS", value_delimiter = ',', requires = "table")]
+    words: Vec<String>,
     /// Store: delivered messages only
     #[arg(long, conflicts_with_all = ["lost", "table"])]
     delivered: bool,
@@ -117,6 +143,18 @@ pub(super) fn estimators() -> String {
         "Estimators, comma-separated, name or name:k: {} (`ccmarl list estimator` describes them)",
         names.join(", ")
     )
+}
+
+/// Names of columns that were given together.
+type Names = std::sync::Arc<[String]>;
+
+/// Reads `a,b`, or a pattern, which may have commas in it.
+#[expect(clippy::unnecessary_wraps, reason = "clap's signature")]
+fn columns(text: &str) -> Result<Names, std::convert::Infallible> {
+    if text.starts_with("regex:") {
+        return Ok(std::sync::Arc::from([text.to_owned()]));
+    }
+    Ok(text.split(',').map(str::to_owned).collect())
 }
 
 /// Rows from x to y.
@@ -171,7 +209,7 @@ type Write = fn(&[Estimate]) -> Result<Vec<u8>, String>;
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     end_on_signals()?;
     let plan = plan(args)?;
-    let write = args.out.as_deref().map(|path| writer(path, &args.path, args.force)).transpose()?;
+    let write = args.out.as_deref().map(|path| writer(path, &args.paths, args.force)).transpose()?;
     let plot = args.plot.as_deref().map(|path| heatmap::target(path, args.force)).transpose()?;
     if plot.is_some() {
         refuse_undrawable(args)?;
@@ -213,6 +251,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
 fn refuse_undrawable(args: &Args) -> Result<(), Error> {
     let message = if !args.all_pairs && !args.x.is_empty() {
         "--plot draws a matrix: give --all-pairs, or a store"
+    } else if !args.by.is_empty() {
+        "--plot draws one matrix: leave out --by"
     } else if args.lag.len() > 1 {
         "--plot draws one lag: give --lag one number"
     } else if args.all_pairs && args.lag.iter().any(|&lag| lag > 0) {
@@ -241,9 +281,9 @@ pub(super) fn named(names: &[String]) -> Result<Vec<mi::Named>, Error> {
     Ok(estimators)
 }
 
-fn writer(path: &Path, input: &Path, force: bool) -> anyhow::Result<Write> {
+fn writer(path: &Path, inputs: &[PathBuf], force: bool) -> anyhow::Result<Write> {
     let real = |p: &Path| p.canonicalize().ok();
-    if real(path).is_some() && real(path) == real(input) {
+    if real(path).is_some() && inputs.iter().any(|input| real(path) == real(input)) {
         let message = format!("--out would replace the input: {}", path.display());
         return Err(Error::Usage(message).into());
     }
@@ -263,15 +303,27 @@ fn writer(path: &Path, input: &Path, force: bool) -> anyhow::Result<Write> {
 }
 
 fn samples(args: &Args) -> Result<Vec<Samples>, Error> {
-    let sets = unlagged(args)?;
-    let (mut out, mut short) = (Vec::new(), Vec::new());
-    for set in &sets {
-        for &lag in args.lag.iter() {
-            match pairs::lagged(set, lag) {
-                Ok(samples) => out.push(samples),
-                Err(error) => short.push((place(&set.labels), error)),
+    let (sets, by) = unlagged(args)?;
+    let (mut out, mut short, mut lagging) = (Vec::new(), Vec::new(), Lagging::default());
+    let mut lagged = |set: &Samples, lag: usize| match lagging.lagged(set, lag) {
+        Ok(samples) => Some(samples),
+        Err(error) => {
+            short.push((place(&set.labels), error));
+            None
+        }
+    };
+    // pooled links are put together lag by lag; else a link's lags stay together
+    match by {
+        Some(by) => {
+            for &lag in args.lag.iter() {
+                out.extend(by.regroup(sets.iter().filter_map(|set| lagged(set, lag)).collect())?);
             }
         }
+        None => out.extend(
+            sets.iter()
+                .flat_map(|set| args.lag.iter().map(move |&lag| (set, lag)))
+                .filter_map(|(set, lag)| lagged(set, lag)),
+        ),
     }
     if out.is_empty()
         && let Some((_, error)) = short.pop()
@@ -284,35 +336,54 @@ fn samples(args: &Args) -> Result<Vec<Samples>, Error> {
     Ok(out)
 }
 
-fn unlagged(args: &Args) -> Result<Vec<Samples>, Error> {
-    let path = &args.path;
+/// The samples without a lag; and how links are to be pooled, if they are.
+fn unlagged(args: &Args) -> Result<(Vec<Samples>, Option<By>), Error> {
+    let filter = args.filter.as_deref().map(Predicate::parse).transpose()?;
+    let paths = pairs::matching(&args.paths)?;
     if !args.x.is_empty() || args.all_pairs {
-        let (x, y, given) = (args.x.clone(), args.y.clone(), args.given.clone());
-        let options = TableOptions { x, y, given, group: args.group.clone(), time: args.time.clone() };
-        if args.all_pairs {
-            let (sets, left_out) = pairs::all_pairs(path, &options)?;
-            for what in left_out {
-                ui::say(&format!("note: left out: {what}"));
-            }
-            return Ok(sets);
-        }
-        if options.y.is_empty() {
+        let names = |given: &[Names]| given.iter().flat_map(|names| names.iter().cloned()).collect();
+        let options = TableOptions {
+            x: names(&args.x),
+            y: names(&args.y),
+            given: names(&args.given),
+            group: args.group.clone(),
+            time: args.time.clone(),
+            words: args.words.clone(),
+            filter,
+            by: args.by.clone(),
+        };
+        if options.y.is_empty() && !args.all_pairs {
             return Err(Error::Usage("--x needs --y, or --all-pairs".to_owned()));
         }
-        return Ok(vec![pairs::table(path, &options)?]);
+        let read = if args.all_pairs { pairs::all_pairs } else { pairs::tables };
+        let (sets, left_out) = read(&paths, &options)?;
+        for what in left_out {
+            ui::say(&format!("note: left out: {what}"));
+        }
+        return Ok((sets, None));
+    }
+    let path = &paths[0];
+    if paths.len() > 1 {
+        let message = "several paths are read as tables, with --x and --y; a store is read alone";
+        return Err(Error::Usage(format!("{message}: {}", path.display())));
     }
     if !pairs::is_store(path)? {
         return Err(PairsError::NoColumns(path.clone()).into());
     }
+    let by = By::parse(&args.by)?;
     let mut source = storage::open(path)?;
-    let mut sets = pairs::links(source.as_mut())?;
+    let mut links = pairs::links(source.as_mut())?;
+    if let Some(predicate) = &filter {
+        links.keep(predicate, path)?;
+    }
+    let mut sets = links.sets;
     for (delivered, unwanted) in [(true, args.lost), (false, args.delivered)] {
         sets.retain(|s| !unwanted || s.labels.delivered != Some(delivered));
         if !unwanted && !sets.iter().any(|s| s.labels.delivered == Some(delivered)) {
             ui::say(&format!("note: the store holds no {} message", class(delivered)));
         }
     }
-    Ok(sets)
+    Ok((sets, Some(by).filter(|by| !by.is_links())))
 }
 
 /// All rows, and the jobs that gave none; an error when no job gave any.
@@ -337,17 +408,17 @@ fn class(delivered: bool) -> &'static str {
     if delivered { "delivered" } else { "lost" }
 }
 
-/// `agent_0 → agent_1 delivered`, or `a,b → c`.
+/// `agent_0 → agent_1 delivered`, or `a,b → c`; behind a comma, which part of the data.
 fn place(labels: &SampleLabels) -> String {
-    match (&labels.sender, &labels.receiver, labels.delivered) {
-        (Some(sender), Some(receiver), Some(delivered)) => {
-            let lag = labels.y.rsplit_once("[+").map_or(String::new(), |(_, lag)| format!(" [+{lag}"));
-            format!("{sender} → {receiver} {}{lag}", class(delivered))
-        }
-        _ => match &labels.given {
-            Some(given) => format!("{} ; {} | {given}", labels.x, labels.y),
-            None => format!("{} ; {}", labels.x, labels.y),
-        },
+    let within = labels.within.as_ref().map_or(String::new(), |within| format!(", {within}"));
+    if let Some(delivered) = labels.delivered {
+        let agent = |agent: &Option<String>| agent.clone().unwrap_or_else(|| "all".to_owned());
+        let lag = labels.y.rsplit_once("[+").map_or(String::new(), |(_, lag)| format!(" [+{lag}"));
+        return format!("{} → {} {}{lag}{within}", agent(&labels.sender), agent(&labels.receiver), class(delivered));
+    }
+    match &labels.given {
+        Some(given) => format!("{} ; {} | {given}{within}", labels.x, labels.y),
+        None => format!("{} ; {}{within}", labels.x, labels.y),
     }
 }
 
@@ -363,7 +434,7 @@ fn print(rows: &[Estimate], samples: &[Samples]) -> anyhow::Result<()> {
     let mut places = rows.iter().map(|row| {
         samples.iter().map(|s| &s.labels).find(|l| {
             (&l.x, &l.y, &l.sender, &l.receiver) == (&row.x, &row.y, &row.sender, &row.receiver)
-                && l.delivered == row.delivered
+                && (l.delivered, &l.group) == (row.delivered, &row.group)
         })
     });
     let mut before = String::new();
@@ -399,7 +470,7 @@ fn print(rows: &[Estimate], samples: &[Samples]) -> anyhow::Result<()> {
         before = here;
     }
     ui::print_table(&["samples", "estimator", "value", "95 % interval", "unit", "p", "n", "n_eff"], &lines)?;
-    if samples.iter().any(|s| s.labels.group == "row") {
+    if samples.iter().any(|s| s.labels.group.split(',').next() == Some("row")) {
         ui::print("each row was taken as independent; give --group or --time if rows belong together")?;
     }
     for (warning, places) in warnings {

@@ -83,7 +83,7 @@ pub const ESTIMATORS: &[Entry<Build>] = &[
 ];
 
 /// What an entry of `warnings` begins with that explains and does not warn.
-pub const NOTE: &str = "note: ";
+pub const NOTE: &str = crate::schema::NOTE;
 
 /// Makes an estimator from its parameters.
 pub type Build = fn(&Spec) -> Result<Box<dyn Estimator>, RegistryError>;

@@ -2,14 +2,22 @@
 //!
 //! [`links`] reads a store: one set of samples per ordered link and class, delivered and lost apart. [`table()`] reads
 //! anybody's table, in any form of [`crate::storage::TableForm`]: one set from named columns, or [`all_pairs`] of them.
-//! [`lagged`] moves y in time.
+//! [`Lagging`] moves y in time; [`By`] pools links and
+//! divides episodes; a [`Predicate`] leaves rows out.
 
+mod by;
+mod dates;
 mod error;
 mod lag;
+mod paths;
+mod predicate;
 mod store;
 mod table;
 
+pub use by::By;
 pub use error::PairsError;
-pub use lag::lagged;
-pub use store::links;
-pub use table::{TableOptions, all_pairs, is_store, table};
+pub use lag::Lagging;
+pub use paths::matching;
+pub use predicate::Predicate;
+pub use store::{Links, links};
+pub use table::{TableOptions, all_pairs, is_store, table, tables};

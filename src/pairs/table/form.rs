@@ -7,11 +7,13 @@ use std::path::Path;
 
 use polars::prelude::{DataFrame, PolarsError};
 
+use super::ipc::Ipc;
+use super::npy::Npy;
 use super::parquet::Parquet;
 use super::text::Text;
+use super::topics::Topics;
 use crate::io::IoError;
 use crate::pairs::PairsError;
-use crate::registry::did_you_mean;
 use crate::storage::{TableForm, table_form};
 
 /// One foreign file of named columns.
@@ -19,7 +21,7 @@ pub(super) trait TableFile {
     /// The names of its columns, in its order.
     fn names(&self) -> Result<Vec<String>, PairsError>;
 
-    /// Columns that it has, each name once.
+    /// Columns that it has, each name once; the cells of text as they stand there.
     fn read(&self, columns: &[&str]) -> Result<DataFrame, PairsError>;
 }
 
@@ -30,6 +32,9 @@ pub(super) fn caught<T>(
 ) -> Result<T, PairsError> {
     if !path.exists() {
         return Err(IoError::Missing(path.to_owned()).into());
+    }
+    if path.is_dir() {
+        return Err(PairsError::Directory(path.to_owned()));
     }
     let form = table_form(path)?;
     guarded(path, form, || read(opened(path, form)?.as_ref()))
@@ -49,23 +54,13 @@ pub(super) fn guarded<T>(
 
 fn opened(path: &Path, form: TableForm) -> Result<Box<dyn TableFile>, PairsError> {
     Ok(match form {
-        TableForm::Csv => Box::new(Text::new(path, form, b',')),
-        TableForm::Tsv => Box::new(Text::new(path, form, b'\t')),
+        TableForm::Csv => Box::new(Text::new(path, form, b',')?),
+        TableForm::Tsv => Box::new(Text::new(path, form, b'\t')?),
         TableForm::Parquet => Box::new(Parquet::new(path)?),
+        TableForm::IpcFile | TableForm::IpcStream => Box::new(Ipc::new(path, form)?),
+        TableForm::Npy => Box::new(Npy::new(path)?),
+        TableForm::Mcap => Box::new(Topics::new(path)),
     })
-}
-
-/// The wanted columns of a file, which must have them.
-pub(super) fn wanted(file: &dyn TableFile, path: &Path, wanted: &[&str]) -> Result<DataFrame, PairsError> {
-    let names = file.names()?;
-    if let Some(&name) = wanted.iter().find(|w| !names.iter().any(|n| n == *w)) {
-        let hint = did_you_mean(name, names.iter().map(String::as_str));
-        return Err(PairsError::UnknownColumn { name: name.to_owned(), hint, path: path.to_owned() });
-    }
-    let mut columns: Vec<&str> = wanted.to_vec();
-    columns.sort_unstable();
-    columns.dedup();
-    file.read(&columns)
 }
 
 /// The file, open.

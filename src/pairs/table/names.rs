@@ -1,9 +1,9 @@
 //! Columns by pattern.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::TableOptions;
-use super::form::TableFile;
+use super::form::{TableFile, caught};
 use crate::pairs::PairsError;
 
 /// What a name begins with that is a pattern.
@@ -38,4 +38,10 @@ pub(super) fn expanded(file: &dyn TableFile, path: &Path, options: &TableOptions
         *list = found;
     }
     Ok(out)
+}
+
+/// All columns of the first file.
+pub(super) fn of_first(paths: &[PathBuf]) -> Result<Vec<String>, PairsError> {
+    let path = paths.first().ok_or_else(|| PairsError::NoFiles("no file was named".to_owned()))?;
+    caught(path, |file| file.names())
 }

@@ -6,6 +6,7 @@ use polars::prelude::{DataFrame, ParquetReader, SerReader as _};
 
 use super::form::{TableFile, open, unreadable};
 use crate::pairs::PairsError;
+use crate::storage::TableForm;
 
 const FORM: &str = "Parquet";
 
@@ -14,7 +15,7 @@ pub(super) struct Parquet(PathBuf);
 
 impl Parquet {
     pub(super) fn new(path: &Path) -> Result<Self, PairsError> {
-        crate::storage::check_table(path)?;
+        crate::storage::check_table(path, TableForm::Parquet)?;
         Ok(Self(path.to_owned()))
     }
 }

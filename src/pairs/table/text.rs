@@ -1,14 +1,19 @@
-//! CSV and TSV.
+//! CSV and TSV. The first line names the columns.
 
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use polars::prelude::{CsvReadOptions, DataFrame, SerReader as _};
 
 use super::form::{TableFile, open, unreadable};
+use crate::io::IoError;
 use crate::pairs::PairsError;
 use crate::storage::TableForm;
 
-/// Lines of text, the first of which names the columns.
+/// Longest line, bytes.
+const LINE_LIMIT: usize = 16 << 20;
+
+/// Lines of text, none of which is absurdly long.
 pub(super) struct Text {
     path: PathBuf,
     form: TableForm,
@@ -16,11 +21,13 @@ pub(super) struct Text {
 }
 
 impl Text {
-    pub(super) fn new(path: &Path, form: TableForm, separator: u8) -> Self {
-        Self { path: path.to_owned(), form, separator }
+    pub(super) fn new(path: &Path, form: TableForm, separator: u8) -> Result<Self, PairsError> {
+        check_lines(path, form)?;
+        Ok(Self { path: path.to_owned(), form, separator })
     }
 
     fn finish(&self, options: CsvReadOptions) -> Result<DataFrame, PairsError> {
+        let options = options.with_infer_schema_length(Some(0));
         let options = options.map_parse_options(|options| options.with_separator(self.separator));
         let frame = options.into_reader_with_file_handle(open(&self.path)?).finish();
         frame.map_err(unreadable(self.form.name(), &self.path))
@@ -29,13 +36,43 @@ impl Text {
 
 impl TableFile for Text {
     fn names(&self) -> Result<Vec<String>, PairsError> {
-        let frame = self.finish(CsvReadOptions::default().with_n_rows(Some(0)).with_infer_schema_length(Some(0)))?;
+        let frame = self.finish(CsvReadOptions::default().with_n_rows(Some(0)))?;
         Ok(frame.get_column_names().into_iter().map(ToString::to_string).collect())
     }
 
     fn read(&self, columns: &[&str]) -> Result<DataFrame, PairsError> {
-        // the whole file decides a column's type: a float in the last row must not be an error
         let columns = columns.iter().map(|&c| c.into()).collect();
-        self.finish(CsvReadOptions::default().with_infer_schema_length(None).with_columns(Some(columns)))
+        self.finish(CsvReadOptions::default().with_columns(Some(columns)))
+    }
+}
+
+/// How zip archives (spreadsheets, .npz) and gzip files begin.
+const PACKED: [&[u8]; 2] = [b"PK\x03\x04", b"\x1f\x8b"];
+
+/// Refuses what is packed, and a line that is longer than [`LINE_LIMIT`]: no table has one, and the reader would hold it
+/// in memory.
+fn check_lines(path: &Path, form: TableForm) -> Result<(), PairsError> {
+    let (mut file, mut block) = (open(path)?, vec![0; 1 << 18]);
+    let (mut line, mut length) = (1_u64, 0);
+    loop {
+        let read = file.read(&mut block).map_err(IoError::os("read", path))?;
+        if line == 1 && PACKED.iter().any(|magic| block[..read].starts_with(magic)) {
+            let message = "it is packed (zip, gzip, .npz, a spreadsheet): unpack it, or save it as a table".to_owned();
+            return Err(PairsError::Unreadable { form: form.name(), message, path: path.to_owned() });
+        }
+        let mut pieces = block[..read].split(|&byte| byte == b'\n');
+        length += pieces.next().map_or(0, <[u8]>::len);
+        for piece in pieces {
+            if length > LINE_LIMIT {
+                break;
+            }
+            (line, length) = (line + 1, piece.len());
+        }
+        if length > LINE_LIMIT {
+            return Err(PairsError::LongLine { line, limit: LINE_LIMIT, path: path.to_owned() });
+        }
+        if read == 0 {
+            return Ok(());
+        }
     }
 }
