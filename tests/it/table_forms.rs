@@ -10,6 +10,8 @@ use ccmarl::pairs::{Predicate, TableOptions, tables};
 use ccmarl::schema::{Columns, Samples};
 use serde_json::Value;
 
+use super::estimate_mi::run;
+
 const N: usize = 40;
 
 fn form(name: &str) -> PathBuf {
@@ -216,13 +218,6 @@ fn a_damaged_arrow_file_is_an_error_and_never_a_panic() {
     }
 }
 
-fn run(args: &[&str]) -> (i32, String, String) {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_ccmarl"));
-    let output = command.env_remove("COLUMNS").arg("estimate-mi").args(args).output().unwrap();
-    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
-    (output.status.code().unwrap(), text(output.stdout), text(output.stderr))
-}
-
 fn json(args: &[&str]) -> Vec<Value> {
     let (code, out, err) =
         run(&[args, &["--estimator", "gaussian", "--permutations", "0", "--format", "json"]].concat());
@@ -300,6 +295,8 @@ fn cells_are_read_honestly_or_not_at_all() {
     let empty = text(dir.path(), "empty.csv", "a,b\n");
     let all = csv(dir.path(), "all.csv", 0);
     let long = text(dir.path(), "long.csv", &format!("a,b\n1,2\n\"{}\",2\n", "x".repeat((16 << 20) + 1)));
+    let uneven = text(dir.path(), "uneven.csv", "a,b\n1,\"2,\n3\"\n3,4,5\n");
+    let semicolons = text(dir.path(), "semicolons.csv", "a;b\n1;2\n");
     let packed = text(dir.path(), "a.npz", "PK\u{3}\u{4} and so on");
     let store = dir.path().join("folder").to_string_lossy().into_owned();
     std::fs::create_dir(&store).unwrap();
@@ -308,6 +305,12 @@ fn cells_are_read_honestly_or_not_at_all() {
             1,
             &[&stray, "--x", "a", "--y", "b"][..],
             "column \"a\", row 3: expected a number, as in 5 of 6 rows, found \"abc\"; leave the cell empty or write NA where a value is missing, leave rows out with --where, or give --words a to take all of them as words: ",
+        ),
+        (1, &[&uneven, "--x", "a", "--y", "b"], "row 2 has 3 fields, expected 2 as in the first line"),
+        (
+            2,
+            &[&semicolons, "--x", "a", "--y", "b"],
+            "no column \"a\": its only column is \"a;b\": expected commas (tabs in a .tsv) between columns",
         ),
         (
             1,

@@ -123,7 +123,9 @@ fn hostile_text_is_an_error_and_overflows_nothing() {
         [deep("(", ")", 4000), deep("NOT ", "", 2400), deep("- ", "", 4000), format!("t{}", " OR t".repeat(1900))]
     {
         let error = bound(&text).map(|_| ()).unwrap_err();
-        assert!(error.contains("nested deeper than 100"), "{}", &error[error.len() - 200..]);
+        // where the parser tries two readings it tells of the second
+        let told = ["nested deeper than 100", "expected its end, found NOT"].iter().any(|text| error.contains(text));
+        assert!(told, "{}", &error[error.len() - 200..]);
     }
     let long = bound(&format!("a IN ({})", "1, ".repeat(4000))).map(|_| ()).unwrap_err();
     assert!(long.ends_with("expected at most 10000 bytes, found 12008"), "{}", &long[long.len() - 100..]);

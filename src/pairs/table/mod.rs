@@ -78,7 +78,7 @@ pub fn is_store(path: &Path) -> Result<bool, PairsError> {
         return Ok(true);
     }
     let form = table_form(path)?;
-    Ok(form == TableForm::Parquet && guarded(path, form, || parquet::is_store(path))?)
+    Ok(form == TableForm::Parquet && guarded(path, form, || self::parquet::is_store(path))?)
 }
 
 /// Samples from the named columns of one file. Rows with a missing value are left out and counted in the notes.

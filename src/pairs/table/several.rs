@@ -157,7 +157,12 @@ fn read(file: &dyn TableFile, path: &Path, options: &TableOptions) -> Result<Dat
     columns.sort_unstable();
     columns.dedup();
     if let Some(&name) = columns.iter().find(|name| !has(name)) {
-        let hint = did_you_mean(name, known.iter().map(String::as_str));
+        let hint = match known.as_slice() {
+            [one] if one.contains([';', '|', '\t']) => {
+                format!("its only column is {one:?}: expected commas (tabs in a .tsv) between columns")
+            }
+            _ => did_you_mean(name, known.iter().map(String::as_str)),
+        };
         return Err(PairsError::UnknownColumn { name: name.to_owned(), hint, path: path.to_owned() });
     }
     let fail = || unreadable("table", path);

@@ -1,6 +1,6 @@
 //! CSV and TSV. The first line names the columns.
 
-use std::io::Read as _;
+use std::io::{BufReader, Read as _};
 use std::path::{Path, PathBuf};
 
 use polars::prelude::{CsvReadOptions, DataFrame, SerReader as _};
@@ -30,7 +30,35 @@ impl Text {
         let options = options.with_infer_schema_length(Some(0));
         let options = options.map_parse_options(|options| options.with_separator(self.separator));
         let frame = options.into_reader_with_file_handle(open(&self.path)?).finish();
-        frame.map_err(unreadable(self.form.name(), &self.path))
+        frame.map_err(|error| match self.uneven() {
+            Some((row, found, expected)) => {
+                let message = format!("row {row} has {found} fields, expected {expected} as in the first line");
+                PairsError::Unreadable { form: self.form.name(), message, path: self.path.clone() }
+            }
+            None => unreadable(self.form.name(), &self.path)(error),
+        })
+    }
+
+    /// The first row of data with more fields than the first line, how many those are, and how many it may have; asked
+    /// only when the reader gave up, since it does not say where.
+    fn uneven(&self) -> Option<(usize, usize, usize)> {
+        let input = BufReader::with_capacity(1 << 18, open(&self.path).ok()?);
+        let (mut row, mut fields, mut expected, mut quoted) = (0, 1, 0, false);
+        for byte in input.bytes() {
+            match byte.ok()? {
+                b'"' => quoted = !quoted,
+                b'\n' if !quoted => {
+                    if row > 0 && fields > expected {
+                        return Some((row, fields, expected));
+                    }
+                    expected = if row == 0 { fields } else { expected };
+                    (row, fields) = (row + 1, 1);
+                }
+                byte if byte == self.separator && !quoted => fields += 1,
+                _ => {}
+            }
+        }
+        (row > 0 && fields > expected).then_some((row, fields, expected))
     }
 }
 
