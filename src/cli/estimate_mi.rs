@@ -36,16 +36,18 @@ For a store: x is the message that the sender sent, y the action of the receiver
 delivered and lost apart. Values are in nats unless the unit says jsd. p: episodes permuted.
 With --by sender, receiver or none, links are pooled: the rows of an episode stay one episode.
 
-A table is CSV, TSV, Parquet, Arrow IPC (file, stream, Feather 2), NPY (columns c0, c1, …, or the names of fields) or MCAP (columns
-/topic.field.path of JSON and protobuf messages, and log_time; columns of two topics are joined by equal log times).
+A table is CSV, TSV, Parquet, Arrow IPC (file, stream, Feather 2), NPY (columns c0, c1, …, or the
+names of its fields) or MCAP (columns /topic.field.path of JSON and protobuf messages, and log_time;
+columns of two topics are joined where their log times are equal).
 Several files: their rows follow each other; the column file says which one a row is of.
-Cells of text: a column is numbers, true/false, dates or words; missing are empty cells, NA, N/A, NaN and null, and in any case of letters
-none and - where the others are numbers or dates. A stray cell among numbers is an error: --words takes the column as it is.
-Dates (2024-01-31, 2024-01-31T12:00:00.5+01:00) are seconds since the first of them. Columns of words are categories: discrete
-and ksg-mixed take them.
---where: = <> < <= > >=, AND, OR, NOT, BETWEEN, IN (…), IS [NOT] NULL, LIKE, + - * / %, 'text', '2024-01-31' beside dates,
-\"columns with blanks\". A missing cell is NULL, and so is what is divided by zero; / never rounds.
---by: the group of a row tells the part (row, city = Rome; episode, steps 0–9).
+Text: a column is numbers, true/false, dates or words. Missing are empty cells, NA, N/A, NaN, null,
+and beside numbers or dates also none and -. A stray cell among numbers is an error: --words takes
+the column as words. Columns of words are categories: discrete and ksg-mixed take them.
+Dates (2024-01-31, 2024-01-31T12:00:00.5+01:00) are seconds since the first of them.
+--where: = <> < <= > >=, AND, OR, NOT, BETWEEN, IN (…), IS [NOT] NULL, LIKE, + - * / %, 'text',
+'2024-01-31' beside dates, \"columns with blanks\". A missing cell is NULL, and so is what is divided
+by zero; / never rounds.
+--by: the group of a row tells its part (row, city = Rome; episode, steps 0–9).
 The rows mean:
   auto           one value: chosen by types, ties, width and size, and by what several estimators say
   jsd            2·JSD of the critic, 0 to 2 ln 2: a lower bound on its own scale, not nats

@@ -50,8 +50,10 @@ impl By {
     ///
     /// # Errors
     /// [`PairsError::TooManyRows`], [`PairsError::TooManySteps`].
-    pub fn regroup(self, sets: Vec<Samples>) -> Result<Vec<Samples>, PairsError> {
-        let sets = self.steps.map_or(Ok(sets.clone()), |steps| divided(&sets, steps))?;
+    pub fn regroup(self, mut sets: Vec<Samples>) -> Result<Vec<Samples>, PairsError> {
+        if let Some(steps) = self.steps {
+            sets = divided(&sets, steps)?;
+        }
         if self.sender && self.receiver {
             return Ok(sets);
         }

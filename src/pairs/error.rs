@@ -168,7 +168,7 @@ pub enum PairsError {
     },
     /// A cell that is not like the others of its column.
     #[error(
-        "column {name:?}, row {row}: expected {expected}, as in {count} of {present} rows, found {found:?}; leave the cell empty or write NA where a value is missing, leave rows out with --where, or give --words {name} to take all of them as words: {}",
+        "column {name:?}, row {row}: expected {expected}, found {found:?}; leave the cell empty or write NA where a value is missing, leave rows out with --where, or give --words {name} to take all of them as words: {}",
         path.display()
     )]
     Stray {
@@ -178,12 +178,8 @@ pub enum PairsError {
         row: usize,
         /// What stands there.
         found: String,
-        /// What most cells are.
-        expected: &'static str,
-        /// How many are.
-        count: usize,
-        /// Cells that are not missing.
-        present: usize,
+        /// What most cells are, and how many.
+        expected: String,
         /// File.
         path: PathBuf,
     },
@@ -210,18 +206,14 @@ pub enum PairsError {
     },
     /// A column that holds other things in another file.
     #[error(
-        "column {name:?} holds {found}, and {expected} in {}: --words {name} takes both as words: {}",
-        first.display(), path.display()
+        "column {name:?} holds {found}: --words {name} takes both as words: {}",
+        path.display()
     )]
     Types {
         /// Column.
         name: String,
-        /// Its type here.
+        /// Its type here, and in the first file.
         found: String,
-        /// Its type in the first file.
-        expected: String,
-        /// The first file.
-        first: PathBuf,
         /// File.
         path: PathBuf,
     },

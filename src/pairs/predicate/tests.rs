@@ -135,9 +135,12 @@ fn hostile_text_is_an_error_and_overflows_nothing() {
     assert!(!keeps(&format!("'{}' LIKE '{pattern}b'", "a".repeat(3000))));
 }
 
-/// A condition as text, and its value for (a, b) by a reading of its own.
-fn condition() -> impl Strategy<Value = (String, fn(Option<i64>, Option<i64>) -> Option<bool>)> {
-    type Case = (&'static str, fn(Option<i64>, Option<i64>) -> Option<bool>);
+/// The value of a condition for (a, b).
+type Meaning = fn(Option<i64>, Option<i64>) -> Option<bool>;
+
+/// A condition as text, and a reading of its own.
+fn condition() -> impl Strategy<Value = (String, Meaning)> {
+    type Case = (&'static str, Meaning);
     let cases: [Case; 8] = [
         ("a < b", |a, b| Some(a? < b?)),
         ("a = b", |a, b| Some(a? == b?)),

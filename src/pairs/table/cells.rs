@@ -54,7 +54,7 @@ pub(super) fn typed(column: &Column, as_words: bool, path: &Path) -> Result<Colu
     let Ok(cells) = column.str() else { return Ok(column.clone()) };
     let name = column.name().clone();
     if as_words {
-        return Ok(words(cells, |cell| cell.is_empty()).into());
+        return Ok(words(cells, str::is_empty).into());
     }
     let trimmed = || cells.iter().map(|cell| cell.unwrap_or("").trim());
     let mut counts = [0; 6];
@@ -84,7 +84,8 @@ pub(super) fn typed(column: &Column, as_words: bool, path: &Path) -> Result<Colu
         let stray = trimmed().enumerate().find(|(_, cell)| !fits(&Cell::of(cell)));
         let (row, found) = stray.map_or((0, String::new()), |(row, cell)| (row + 1, cell.to_owned()));
         let (name, path) = (name.to_string(), path.to_owned());
-        return Err(PairsError::Stray { name, row, found, expected, count, present, path });
+        let expected = format!("{expected}, as in {count} of {present} rows");
+        return Err(PairsError::Stray { name, row, found, expected, path });
     } else {
         words(cells, |cell| NO_WORD.contains(&cell))
     };

@@ -23,6 +23,7 @@ use std::path::{Path, PathBuf};
 use self::chosen::Chosen;
 use self::form::guarded;
 use self::numbers::Holds;
+use self::parquet::is_store as is_parquet_store;
 use self::several::Table;
 use super::{PairsError, Predicate};
 use crate::io::IoError;
@@ -78,7 +79,7 @@ pub fn is_store(path: &Path) -> Result<bool, PairsError> {
         return Ok(true);
     }
     let form = table_form(path)?;
-    Ok(form == TableForm::Parquet && guarded(path, form, || self::parquet::is_store(path))?)
+    Ok(form == TableForm::Parquet && guarded(path, form, || is_parquet_store(path))?)
 }
 
 /// Samples from the named columns of one file. Rows with a missing value are left out and counted in the notes.

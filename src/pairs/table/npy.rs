@@ -337,7 +337,9 @@ mod tests {
     #[test]
     fn halves_are_those_of_ieee() {
         let cases = [(0x3c00, 1.0), (0xc000, -2.0), (0x3555, 0.333251953125), (1, 2_f64.powi(-24)), (0x7bff, 65504.0)];
-        cases.iter().for_each(|&(bits, value)| assert_eq!(half(bits), value, "{bits:x}"));
+        for (bits, value) in cases {
+            assert_eq!(half(bits), value, "{bits:x}");
+        }
         assert!(half(0x7e00).is_nan() && half(0xfc00) == f64::NEG_INFINITY);
         assert_eq!((signed(&[0xfe]), signed(&[0, 0x80]), signed(&[1, 0, 0, 0])), (-2, -32768, 1));
     }

@@ -39,12 +39,11 @@ impl Table {
                 }
                 read(file, path, &expanded)
             })?;
-            match &mut whole {
-                None => {
-                    whole =
-                        Some(Self { files: vec![(path.clone(), frame.height())], frame, kept: None, notes: Vec::new() })
-                }
-                Some(table) => table.append(frame, path)?,
+            if let Some(table) = &mut whole {
+                table.append(frame, path)?;
+            } else {
+                let files = vec![(path.clone(), frame.height())];
+                whole = Some(Self { frame, files, kept: None, notes: Vec::new() });
             }
         }
         let whole = whole.ok_or_else(|| PairsError::NoFiles("no file was named".to_owned()))?;
@@ -94,9 +93,7 @@ impl Table {
             }
             let common = common(mine, other).ok_or_else(|| PairsError::Types {
                 name: name.clone(),
-                found: other.dtype().to_string(),
-                expected: mine.dtype().to_string(),
-                first: first.clone(),
+                found: format!("{}, and {} in {}", other.dtype(), mine.dtype(), first.display()),
                 path: path.to_owned(),
             })?;
             let (mine, other) = (mine.cast(&common).map_err(fail())?, other.cast(&common).map_err(fail())?);

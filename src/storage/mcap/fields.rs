@@ -162,7 +162,7 @@ impl Messages {
             return Ok(());
         }
         if field.repeated {
-            name.push_str(&format!("[{place}]"));
+            name.extend(["[", &place.to_string(), "]"]);
         }
         self.value(field, wire, name, emit, depth)?;
         name.truncate(length);

@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use mcap::parse_record;
-use mcap::records::Record;
+use mcap::records::{Record, op};
 use mcap::sans_io::linear_reader::LinearReaderOptions;
 
 use super::fields::Messages;
@@ -195,7 +195,7 @@ fn json(value: &serde_json::Value, name: &mut String, emit: &mut Emit<'_>) -> Re
         },
         Value::Array(items) => {
             for (i, item) in items.iter().enumerate().take(COLUMN_LIMIT) {
-                name.push_str(&format!("[{i}]"));
+                name.extend(["[", &i.to_string(), "]"]);
                 json(item, name, emit)?;
                 name.truncate(length);
             }
@@ -212,17 +212,30 @@ fn json(value: &serde_json::Value, name: &mut String, emit: &mut Emit<'_>) -> Re
     Ok(())
 }
 
+/// What takes a message: its channel, log time and bytes.
+type TakeMessage<'a> = dyn FnMut(&Channel, u64, &[u8]) -> Result<(), String> + 'a;
+
 /// Calls `take` with every message of a readable channel, its log time and its bytes; returns the topics that are not
 /// readable, with their encoding.
-fn each_message(
-    path: &Path,
-    take: &mut dyn FnMut(&Channel, u64, &[u8]) -> Result<(), String>,
-) -> Result<BTreeMap<String, String>, StorageError> {
+fn each_message(path: &Path, take: &mut TakeMessage<'_>) -> Result<BTreeMap<String, String>, StorageError> {
+    check_chunks(path)?;
     let options = LinearReaderOptions::default().with_prevalidate_chunk_crcs(true);
     let mut schemas: BTreeMap<u16, (String, String, Vec<u8>)> = BTreeMap::new();
     let mut channels: BTreeMap<u16, Channel> = BTreeMap::new();
     let mut unread = BTreeMap::new();
     let read = Records::open(path, options)?.each(|opcode, body| {
+        if opcode == op::DATA_END {
+            return Ok(true); // what follows repeats what was there
+        }
+        let fits = match opcode {
+            op::SCHEMA => strings(body, 2, 3).is_some(),
+            op::CHANNEL => strings(body, 4, 2).is_some_and(|map| strings(map, 0, 1) == Some(&[]) && pairs(&map[4..])),
+            op::MESSAGE => true,
+            _ => return Ok(false),
+        };
+        if !fits {
+            return Err("a schema or channel claims more than its record holds".to_owned());
+        }
         match parse_record(opcode, body).map_err(|e| e.to_string())? {
             Record::Schema { header, data } => {
                 schemas.insert(header.id, (header.name, header.encoding, data.into_owned()));
@@ -250,8 +263,57 @@ fn each_message(
         }
         Ok(false)
     });
+    ended(read, path).map(|()| unread)
+}
+
+/// What is left of a record behind `count` texts with their lengths, the first at byte `from`: the parser would give memory
+/// to any length.
+fn strings(body: &[u8], from: usize, count: usize) -> Option<&[u8]> {
+    let mut rest = body.get(from..)?;
+    for _ in 0..count {
+        let (length, behind) = rest.split_first_chunk()?;
+        rest = behind.get(u32::from_le_bytes(*length) as usize..)?;
+    }
+    Some(rest)
+}
+
+/// Whether these bytes are texts with their lengths, to the end.
+fn pairs(mut map: &[u8]) -> bool {
+    while !map.is_empty() {
+        let Some(rest) = strings(map, 0, 2) else { return false };
+        map = rest;
+    }
+    true
+}
+
+/// What a chunk may become: this many bytes, or so many times its own length. Its reader believes what it claims.
+const CHUNK_LIMIT: u64 = 64 << 20;
+const RATIO_LIMIT: u64 = 256;
+
+/// Refuses a chunk that claims to be absurdly long.
+fn check_chunks(path: &Path) -> Result<(), StorageError> {
+    let options = LinearReaderOptions::default().with_emit_chunks(true);
+    let read = Records::open(path, options)?.each(|opcode, body| {
+        if opcode == op::DATA_END {
+            return Ok(true);
+        }
+        if opcode == op::CHUNK
+            && strings(body, 28, 1).is_some()
+            && let Record::Chunk { header, .. } = parse_record(opcode, body).map_err(|e| e.to_string())?
+        {
+            let (packed, plain) = (header.compressed_size, header.uncompressed_size);
+            if plain > CHUNK_LIMIT.max(packed.min(body.len() as u64).saturating_mul(RATIO_LIMIT)) {
+                return Err(format!("a chunk of {packed} bytes claims {plain}"));
+            }
+        }
+        Ok(false)
+    });
+    ended(read, path)
+}
+
+fn ended(read: Result<bool, Stop>, path: &Path) -> Result<(), StorageError> {
     match read {
-        Ok(_) => Ok(unread),
+        Ok(_) => Ok(()),
         Err(Stop::Short) => Err(damaged(path, "cut short: copy it again".to_owned())),
         Err(Stop::Error(error)) => Err(error),
     }
