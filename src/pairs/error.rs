@@ -89,7 +89,7 @@ pub enum PairsError {
         path: PathBuf,
     },
     /// A column that holds no numbers.
-    #[error("column {name:?} holds {kind}, expected integers, floats or booleans; {hint}: {}", path.display())]
+    #[error("column {name:?} holds {kind}, expected numbers, booleans, dates or words; {hint}: {}", path.display())]
     NotNumeric {
         /// Column.
         name: String,

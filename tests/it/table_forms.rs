@@ -129,6 +129,30 @@ fn arrays_hold_what_numpy_wrote() {
     );
 }
 
+#[test]
+fn types_that_are_not_read_are_named_and_stand_in_nobodys_way() {
+    for name in ["odd.feather", "odd.parquet"] {
+        for (column, kind) in [("decimal", "Decimal(10, 2)"), ("half", "Float16"), ("pose", "Struct(")] {
+            let error = read(&[form(name)], &options(&["x"], &[column])).unwrap_err();
+            let expected = format!("column {column:?} holds {kind}");
+            assert!(
+                error.starts_with(&expected) && error.contains("write it as float64, an integer or text"),
+                "{error}"
+            );
+        }
+        let error = read(&[form(name)], &options(&["x"], &["nothing"])).unwrap_err();
+        assert!(
+            error.starts_with("column \"nothing\" holds null, expected numbers, booleans, dates or words"),
+            "{error}"
+        );
+        let found = read(&[form(name)], &options(&["x"], &["y"])).unwrap();
+        assert_eq!((found.len(), found.x.row(3), found.y.row(3)), (20, &[3.0][..], &[2.0][..]));
+        let (sets, left_out) = ccmarl::pairs::all_pairs(&[form(name)], &TableOptions::default()).unwrap();
+        assert_eq!((sets.len(), left_out.len()), (1, 3), "{left_out:?}");
+        assert_eq!(left_out[0], "column \"decimal\" holds Decimal(10, 2)");
+    }
+}
+
 fn save(path: &Path, bytes: &[u8]) {
     // not synced: there are thousands
     std::fs::File::create(path).unwrap().write_all(bytes).unwrap();

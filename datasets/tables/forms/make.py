@@ -9,6 +9,7 @@ predicate keeps (where.json).
 """
 
 import datetime
+import decimal
 import json
 import os
 import random
@@ -60,6 +61,19 @@ def arrow_files():
     frame = table.select(["i", "f", "b", "s", "c", "d", "t"]).to_pandas()
     frame.to_feather(at("pandas.feather"))
     frame.to_csv(at("pandas.csv"), index=False)
+
+
+def odd_types():
+    table = pa.table({
+        "x": pa.array(range(20), pa.uint64()),
+        "y": pa.array([r * r % 7 for r in range(20)], pa.int8()),
+        "decimal": pa.array([decimal.Decimal(r) / 4 for r in range(20)], pa.decimal128(10, 2)),
+        "half": pa.array([r / 2 for r in range(20)], pa.float16()),
+        "pose": pa.array([{"x": r} for r in range(20)]),
+        "nothing": pa.nulls(20),
+    })
+    feather.write_feather(table, at("odd.feather"))
+    parquet.write_table(table, at("odd.parquet"))
 
 
 def arrays():
@@ -145,6 +159,7 @@ def predicates():
 
 
 arrow_files()
+odd_types()
 arrays()
 messages()
 predicates()

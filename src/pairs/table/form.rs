@@ -5,7 +5,7 @@
 use std::fs::File;
 use std::path::Path;
 
-use polars::prelude::{DataFrame, PolarsError};
+use polars::prelude::{ArrowDataType, ArrowField, DataFrame, PolarsError};
 
 use super::ipc::Ipc;
 use super::npy::Npy;
@@ -20,6 +20,11 @@ use crate::storage::{TableForm, table_form};
 pub(super) trait TableFile {
     /// The names of its columns, in its order.
     fn names(&self) -> Result<Vec<String>, PairsError>;
+
+    /// The columns among them of a type that no reader here takes, each with that type.
+    fn unusable(&self) -> Result<Vec<(String, String)>, PairsError> {
+        Ok(Vec::new())
+    }
 
     /// Columns that it has, each name once; the cells of text as they stand there.
     fn read(&self, columns: &[&str]) -> Result<DataFrame, PairsError>;
@@ -61,6 +66,47 @@ fn opened(path: &Path, form: TableForm) -> Result<Box<dyn TableFile>, PairsError
         TableForm::Npy => Box::new(Npy::new(path)?),
         TableForm::Mcap => Box::new(Topics::new(path)),
     })
+}
+
+/// The columns of a schema whose type makes polars panic: decimals, half floats, structures and the like.
+pub(super) fn unusable<'a>(fields: impl Iterator<Item = &'a ArrowField>) -> Vec<(String, String)> {
+    let of = |field: &ArrowField| (field.name.to_string(), format!("{:?}", field.dtype));
+    fields.filter(|field| !is_usable(&field.dtype)).map(of).collect()
+}
+
+fn is_usable(kind: &ArrowDataType) -> bool {
+    use ArrowDataType as Type;
+    match kind {
+        Type::List(inner) | Type::LargeList(inner) | Type::FixedSizeList(inner, _) => is_usable(&inner.dtype),
+        Type::Dictionary(_, inner, _) => is_usable(inner),
+        other => matches!(
+            other,
+            Type::Null
+                | Type::Boolean
+                | Type::Float32
+                | Type::Float64
+                | Type::Int8
+                | Type::Int16
+                | Type::Int32
+                | Type::Int64
+                | Type::UInt8
+                | Type::UInt16
+                | Type::UInt32
+                | Type::UInt64
+                | Type::Timestamp(..)
+                | Type::Date32
+                | Type::Date64
+                | Type::Time32(_)
+                | Type::Time64(_)
+                | Type::Duration(_)
+                | Type::Binary
+                | Type::LargeBinary
+                | Type::BinaryView
+                | Type::Utf8
+                | Type::LargeUtf8
+                | Type::Utf8View
+        ),
+    }
 }
 
 /// The file, open.

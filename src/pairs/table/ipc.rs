@@ -2,9 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use polars::prelude::{DataFrame, IpcReader, IpcStreamReader, SerReader as _};
+use polars::prelude::{ArrowField, DataFrame, IpcReader, IpcStreamReader, SerReader as _};
 
-use super::form::{TableFile, open, unreadable};
+use super::form::{TableFile, open, unreadable, unusable};
 use crate::pairs::PairsError;
 use crate::storage::TableForm;
 
@@ -20,6 +20,16 @@ impl Ipc {
         Ok(Self { path: path.to_owned(), form })
     }
 
+    fn fields(&self) -> Result<Vec<ArrowField>, PairsError> {
+        let file = open(&self.path)?;
+        let fields = if self.is_stream() {
+            IpcStreamReader::new(file).arrow_schema().map(|schema| schema.iter_values().cloned().collect())
+        } else {
+            IpcReader::new(file).schema().map(|schema| schema.iter_values().cloned().collect())
+        };
+        fields.map_err(unreadable(self.form.name(), &self.path))
+    }
+
     fn is_stream(&self) -> bool {
         self.form == TableForm::IpcStream
     }
@@ -27,13 +37,11 @@ impl Ipc {
 
 impl TableFile for Ipc {
     fn names(&self) -> Result<Vec<String>, PairsError> {
-        let (file, unreadable) = (open(&self.path)?, unreadable(self.form.name(), &self.path));
-        let names = if self.is_stream() {
-            IpcStreamReader::new(file).schema().map(|s| s.iter_names().map(ToString::to_string).collect())
-        } else {
-            IpcReader::new(file).schema().map(|s| s.iter_names().map(ToString::to_string).collect())
-        };
-        names.map_err(unreadable)
+        Ok(self.fields()?.into_iter().map(|field| field.name.to_string()).collect())
+    }
+
+    fn unusable(&self) -> Result<Vec<(String, String)>, PairsError> {
+        Ok(unusable(self.fields()?.iter()))
     }
 
     fn read(&self, columns: &[&str]) -> Result<DataFrame, PairsError> {

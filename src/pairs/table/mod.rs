@@ -128,8 +128,9 @@ pub fn all_pairs(paths: &[PathBuf], options: &TableOptions) -> Result<(Vec<Sampl
     whole(paths, || {
         let named = !options.x.is_empty();
         let mut options = options.clone();
+        let mut left_out = Vec::new();
         if !named {
-            options.x = names::of_first(paths)?;
+            (options.x, left_out) = names::of_first(paths)?;
         }
         let (table, options) = filtered(paths, &options)?;
         let keys = options.group.iter().chain(&options.by);
@@ -147,7 +148,7 @@ pub fn all_pairs(paths: &[PathBuf], options: &TableOptions) -> Result<(Vec<Sampl
         let is_empty = |name: &String| table.frame.column(name).is_ok_and(|c| c.null_count() == rows);
         let (empty, full): (Vec<String>, Vec<String>) = columns.into_iter().partition(is_empty);
         let (mut sets, mut last) = (Vec::new(), None);
-        let mut left_out: Vec<String> = empty.iter().map(|name| format!("column {name:?} is empty")).collect();
+        left_out.extend(empty.iter().map(|name| format!("column {name:?} is empty")));
         for (i, j) in (0..full.len()).flat_map(|i| (i + 1..full.len()).map(move |j| (i, j))) {
             let (x, y) = (vec![full[i].clone()], vec![full[j].clone()]);
             let options = TableOptions { x, y, ..options.clone() };

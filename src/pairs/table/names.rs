@@ -40,8 +40,14 @@ pub(super) fn expanded(file: &dyn TableFile, path: &Path, options: &TableOptions
     Ok(out)
 }
 
-/// All columns of the first file.
-pub(super) fn of_first(paths: &[PathBuf]) -> Result<Vec<String>, PairsError> {
+/// All columns of the first file that can be read; and what is said of the others.
+pub(super) fn of_first(paths: &[PathBuf]) -> Result<(Vec<String>, Vec<String>), PairsError> {
     let path = paths.first().ok_or_else(|| PairsError::NoFiles("no file was named".to_owned()))?;
-    caught(path, |file| file.names())
+    caught(path, |file| {
+        let unusable = file.unusable()?;
+        let mut names = file.names()?;
+        names.retain(|name| !unusable.iter().any(|(other, _)| other == name));
+        let said = unusable.into_iter().map(|(name, kind)| format!("column {name:?} holds {kind}"));
+        Ok((names, said.collect()))
+    })
 }

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use polars::prelude::{DataFrame, ParquetReader, SerReader as _};
 
-use super::form::{TableFile, open, unreadable};
+use super::form::{TableFile, open, unreadable, unusable};
 use crate::pairs::PairsError;
 use crate::storage::TableForm;
 
@@ -24,6 +24,11 @@ impl TableFile for Parquet {
     fn names(&self) -> Result<Vec<String>, PairsError> {
         let schema = ParquetReader::new(open(&self.0)?).schema().map_err(unreadable(FORM, &self.0))?;
         Ok(schema.iter_names().map(ToString::to_string).collect())
+    }
+
+    fn unusable(&self) -> Result<Vec<(String, String)>, PairsError> {
+        let schema = ParquetReader::new(open(&self.0)?).schema().map_err(unreadable(FORM, &self.0))?;
+        Ok(unusable(schema.iter_values()))
     }
 
     fn read(&self, columns: &[&str]) -> Result<DataFrame, PairsError> {

@@ -162,6 +162,10 @@ fn read(file: &dyn TableFile, path: &Path, options: &TableOptions) -> Result<Dat
         };
         return Err(PairsError::UnknownColumn { name: name.to_owned(), hint, path: path.to_owned() });
     }
+    if let Some((name, kind)) = file.unusable()?.into_iter().find(|(name, _)| columns.contains(&name.as_str())) {
+        let hint = "write it as float64, an integer or text".to_owned();
+        return Err(PairsError::NotNumeric { name, kind, hint, path: path.to_owned() });
+    }
     let fail = || unreadable("table", path);
     // a file's name alone is no column of it: something must say how many rows there are
     let counted = if columns.is_empty() { known.first().map(String::as_str) } else { None };
