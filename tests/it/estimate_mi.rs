@@ -7,7 +7,7 @@ use assert_cmd::Command;
 use polars::prelude::{Column, DataFrame, NamedFrom as _, ParquetReader, ParquetWriter, SerReader as _, Series};
 use serde_json::Value;
 
-fn run(args: &[&str]) -> (i32, String, String) {
+pub(super) fn run(args: &[&str]) -> (i32, String, String) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_ccmarl"));
     let output = command.env_remove("COLUMNS").arg("estimate-mi").args(args).output().unwrap();
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
