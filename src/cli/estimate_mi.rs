@@ -163,13 +163,13 @@ pub(super) fn estimators() -> String {
 }
 
 /// Names of columns that were given together.
-type Names = std::sync::Arc<[String]>;
+type Names = Arc<[String]>;
 
 /// Reads `a,b`, or a pattern, which may have commas in it.
 #[expect(clippy::unnecessary_wraps, reason = "clap's signature")]
 fn columns(text: &str) -> Result<Names, std::convert::Infallible> {
     if text.starts_with("regex:") {
-        return Ok(std::sync::Arc::from([text.to_owned()]));
+        return Ok(Arc::from([text.to_owned()]));
     }
     Ok(text.split(',').map(str::to_owned).collect())
 }

@@ -111,6 +111,7 @@ pub fn pass(
         }
         notes.extend(read.filtered_note().map(|note| format!("{NOTE}{note}")));
         notes.extend(words.dates.iter().map(|name| format!("{NOTE}dates of {name} are seconds since 1970")));
+        let rows = read.rows;
         if let Some(drawn) = drawn {
             let (table, options) = read.drawn(drawn)?;
             let all = parts(&table, &[])?;
@@ -118,7 +119,7 @@ pub fn pass(
         } else {
             (sample.rows, sample.notes) = (Vec::new(), notes.clone());
         }
-        Ok(Passed { rows: read.rows, used, sample, notes })
+        Ok(Passed { rows, used, sample, notes })
     })
 }
 
@@ -324,7 +325,7 @@ mod tests {
     use crate::rng::{self, Seeds};
 
     /// A CSV table with gaps, words (one of them with a line end) and numbers; the same as Parquet in small row groups.
-    fn tables(rows: usize, seed: u64) -> (tempfile::TempDir, [std::path::PathBuf; 2]) {
+    fn tables(rows: usize, seed: u64) -> (tempfile::TempDir, [PathBuf; 2]) {
         let mut rng = Seeds::new(seed).stream("table");
         let mut text = "a,b,\"w\nord\",c\n".to_owned();
         for row in 0..rows {
@@ -397,7 +398,7 @@ mod tests {
     #[test]
     fn a_sample_is_drawn_beside_the_pass_and_is_the_one_that_the_table_draws_alone() {
         let (_dir, paths) = tables(200, 1);
-        let sample = super::super::Sample { rows: 60, seeds: Seeds::new(1) };
+        let sample = Sample { rows: 60, seeds: Seeds::new(1) };
         for path in &paths {
             let options = TableOptions { sample: Some(sample.clone()), ..of("a", "w\nord", &[]) };
             let (_, _, passed) = joined(path, &options, PieceSize { rows: 7, bytes: 300 });
@@ -405,7 +406,7 @@ mod tests {
             assert_eq!(passed.sample, alone);
             assert!(alone.len() <= 60 && alone.len() > 40 && alone.x.is_words(0) == false && alone.y.is_words(0));
             assert!(alone.notes.contains(&"note: estimated on 60 of 200 rows, drawn at random".to_owned()));
-            let all = TableOptions { sample: Some(super::super::Sample { rows: 1000, ..sample.clone() }), ..options };
+            let all = TableOptions { sample: Some(Sample { rows: 1000, ..sample.clone() }), ..options };
             let (whole, drawn) = (table(path, &of("a", "w\nord", &[])).unwrap(), table(path, &all).unwrap());
             assert_eq!(whole, drawn);
         }
