@@ -429,7 +429,8 @@ fn unlagged(args: &Args) -> Result<(Vec<Samples>, Option<By>), Error> {
     for (delivered, unwanted) in [(true, args.lost), (false, args.delivered)] {
         sets.retain(|s| !unwanted || s.labels.delivered != Some(delivered));
         if !unwanted && !sets.iter().any(|s| s.labels.delivered == Some(delivered)) {
-            ui::say(&format!("note: the store holds no {} message", class(delivered)));
+            let who = if filter.is_some() { "--where leaves" } else { "the store holds" };
+            ui::say(&format!("note: {who} no {} message", class(delivered)));
         }
     }
     Ok((sets, Some(by).filter(|by| !by.is_links())))

@@ -1,5 +1,6 @@
 //! The samples of a store's links put together, or divided by step.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::PairsError;
@@ -94,7 +95,7 @@ impl By {
         }
         let (x, y): (Vec<_>, Vec<_>) = pool.iter().map(|set| (&*set.x, &*set.y)).unzip();
         let [x_name, y_name] = ["message", "action"];
-        let suffix = first.labels.y.find("[+").map_or("", |at| &first.labels.y[at..]);
+        let suffix = first.labels.y.rfind("[+").map_or("", |at| &first.labels.y[at..]);
         let mut labels = first.labels.clone();
         if !self.sender {
             (labels.sender, labels.x) = (None, x_name.to_owned());
@@ -152,15 +153,12 @@ fn divided(sets: &[Samples], steps: usize) -> Result<Vec<Samples>, PairsError> {
         let step = |(&row, &episode): (&u32, &u32)| row as usize - set.starts[episode as usize];
         let episodes = set.episodes();
         let of = || set.rows.iter().zip(&episodes);
-        let last = of().map(step).max().unwrap_or(0);
-        if last / steps >= RANGES {
+        let mut ranges: BTreeMap<usize, Vec<u32>> = BTreeMap::new();
+        of().for_each(|pair| ranges.entry(step(pair) / steps).or_default().push(*pair.0));
+        if ranges.len() > RANGES {
             return Err(PairsError::TooManySteps { steps, most: RANGES });
         }
-        for range in 0..=last / steps {
-            let rows: Vec<u32> = of().filter(|&pair| step(pair) / steps == range).map(|(&row, _)| row).collect();
-            if rows.is_empty() {
-                continue;
-            }
+        for (range, rows) in ranges {
             let within = format!("steps {}–{}", range * steps, range * steps + steps - 1);
             let labels = SampleLabels {
                 group: format!("{}, {within}", set.labels.group),

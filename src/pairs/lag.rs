@@ -38,7 +38,7 @@ impl Lagging {
             self.moved.entry(place).or_insert_with(|| (Arc::clone(&samples.y), Arc::new(later(&samples.y, lag))));
         let mut out = Samples { y: Arc::clone(&moved.1), rows, ..samples.clone() };
         out.labels.y = format!("{}[+{lag}]", samples.labels.y);
-        if !samples.notes.is_empty() {
+        if samples.notes.iter().any(|note| !note.starts_with(NOTE)) {
             out.notes.push(format!("{NOTE}lag {lag} counts the rows that are left"));
         }
         Ok(out)
