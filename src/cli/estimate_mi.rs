@@ -42,6 +42,7 @@ The rows mean:
   l1out          the tighter upper bound alone; club-sample: club with one negative
   club-fit       how much better club's density fits than the margin; near 0 it bounds nothing
   gaussian       exact for normal data, bias-corrected, nats; gcmi: the same after ranks made every column normal
+  t-copula       gcmi for columns that share a heavy tail; says when it does not fit
   ksg1, ksg2     nearest neighbours, no model, nats; ksg-mixed: for ties and discrete beside continuous columns
   discrete       exact counts of categories, nats; discrete-mm: less the bias of few samples";
 

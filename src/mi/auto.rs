@@ -1,14 +1,15 @@
 //! # What it is
 //!
-//! Chooses by what the columns are, and says so. For continuous columns it asks three estimators that err in different
+//! Chooses by what the columns are, and says so. For continuous columns it asks estimators that err in different
 //! places, and takes the largest answer.
 //!
 //! # Definition
 //!
 //! A side is discrete when its columns are words, or its samples take at most twenty values and n/20. Both sides
 //! discrete: `discrete-mm`. Words, or most values of a side repeated: `ksg-mixed`. Else every column is replaced by its normal scores
-//! (`gcmi`), which changes no information, and the largest of `gcmi`, `ksg1` (up to ten columns) and `infonce` (from 200 samples in
-//! 20 episodes; not given z) is taken: the first and the last are lower bounds, and `ksg1` errs to low values in more than two columns.
+//! (`gcmi`), which changes no information, and the largest of `gcmi`, `ksg1` and `t-copula` (up to ten columns; the latter not given z,
+//! and only if it fits) and `infonce` (from 200 samples in 20 episodes; not given z) is taken: the first and the last are lower
+//! bounds, `ksg1` errs to low values in more than two columns, and `t-copula` counts where its own density ratio proves its value.
 //!
 //! # Shapes and units
 //!
@@ -21,8 +22,8 @@
 //!
 //! # When it fails
 //!
-//! The largest of three values leans upwards by about their scatter: 0.01 nats at n = 5000 without dependence. Where all
-//! three are too low it is too low: heavy-tailed dependence and spirals in five columns and more.
+//! The largest of several values leans upwards by about their scatter: 0.01 nats at n = 5000 without dependence. Where all
+//! of them are too low it is too low: spirals in three columns and more.
 //!
 //! # Reference
 //!
@@ -37,6 +38,7 @@ use std::sync::Arc;
 use super::counts::Categories;
 use super::gcmi::normal_scores;
 use super::prepare::tied;
+use super::t_copula::{LIGHT, MISFIT};
 use super::{Build, ESTIMATORS, Estimate, Estimator, MiError, NOTE, Protocol};
 use crate::registry::{Entry, RegistryError, Spec, find};
 use crate::rng::Seeds;
@@ -86,6 +88,8 @@ impl Estimator for Auto {
             // the last row of `discrete` is the corrected one
             rows.extend(estimator.estimate(scored.as_ref().unwrap_or(samples), protocol, &seeds.child(name))?.pop());
         }
+        // a copula that does not fit is no answer, and one without tails is gcmi's
+        rows.retain(|r| !r.warnings.iter().any(|w| w.starts_with(MISFIT) || w.starts_with(LIGHT)));
         let asked = rows.len() as f64;
         let least = rows.iter().map(|r| r.p_value).try_fold(1.0, |least: f64, p| Some(least.min(p?)));
         let values = rows.iter().map(|r| format!("{} {:.3}", r.estimator, r.value)).collect::<Vec<_>>().join(", ");
@@ -134,6 +138,9 @@ fn choose(samples: &Samples) -> Choice {
     let mut estimators = vec!["gcmi"];
     if width <= NARROW {
         estimators.push("ksg1");
+        if samples.z.is_none() {
+            estimators.push("t-copula");
+        }
     }
     let mut episodes = samples.episodes();
     episodes.dedup();
@@ -167,9 +174,9 @@ mod tests {
     fn the_choice_follows_what_the_columns_are() {
         let names = |samples: &Samples| choose(samples).estimators;
         let normal = linear_samples(0.5, 400, 1, 1);
-        assert_eq!(names(&normal), ["gcmi", "ksg1", "infonce"]);
+        assert_eq!(names(&normal), ["gcmi", "ksg1", "t-copula", "infonce"]);
         assert_eq!(names(&linear_samples(0.5, 400, 6, 1)), ["gcmi", "infonce"]);
-        assert_eq!(names(&linear_samples(0.5, 150, 1, 1)), ["gcmi", "ksg1"]);
+        assert_eq!(names(&linear_samples(0.5, 150, 1, 1)), ["gcmi", "ksg1", "t-copula"]);
         let given = Samples { z: Some(Arc::clone(&normal.x)), ..normal.clone() };
         assert_eq!(names(&given), ["gcmi", "ksg1"]);
         let die = column((0..400).map(|i| f64::from(i * i % 7)));

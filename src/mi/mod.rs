@@ -7,7 +7,7 @@
 //! rest of the room is protocol: `prepare` (standardised, split by episode), `fit` (training, stopped on validation),
 //! `interval` (episodes as blocks), `null` (whole episodes permuted), `part` (parts of the samples by whole episodes),
 //! `run` (all jobs in parallel); and what several share: `critic`,
-//! `scorer`, `bounds` and `contrast` (trained critics), `linear` (covariances), `given` (z), `knn` and `neighbours`, `counts`.
+//! `scorer`, `bounds` and `contrast` (trained critics), `linear` (covariances), `student` (t copulas), `given` (z), `knn` and `neighbours`, `counts`.
 
 pub(crate) mod all_pairs;
 mod auto;
@@ -46,6 +46,8 @@ mod run;
 mod scorer;
 pub(crate) mod shifted;
 mod smile;
+mod student;
+mod t_copula;
 mod tasks;
 
 pub use calibrate::{Calibrated, calibrate};
@@ -80,6 +82,7 @@ pub const ESTIMATORS: &[Entry<Build>] = &[
     mine::ENTRY,
     nwj::ENTRY,
     smile::ENTRY,
+    t_copula::ENTRY,
 ];
 
 /// What an entry of `warnings` begins with that explains and does not warn.

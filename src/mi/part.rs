@@ -74,6 +74,12 @@ impl Part {
         self.episodes.len()
     }
 
+    /// Episode of each of the rows.
+    pub(super) fn blocks(&self) -> Vec<u32> {
+        let spans = self.bounds.windows(2).zip(&self.episodes);
+        spans.flat_map(|(span, &episode)| std::iter::repeat_n(episode, span[1] - span[0])).collect()
+    }
+
     /// `statistic` under draws of the null: it is given, for each of the rows, the row whose x takes its place.
     pub(super) fn null(
         &self,
