@@ -28,7 +28,7 @@
 //!
 //! # Reference
 //!
-//! Demarta, McNeil 2005, International Statistical Review 73, 111–129 (the copula); Arellano-Valle, Contreras-Reyes, Genton
+//! Demarta, `McNeil` 2005, International Statistical Review 73, 111–129 (the copula); Arellano-Valle, Contreras-Reyes, Genton
 //! 2013, Scandinavian Journal of Statistics 40 (entropies of t distributions).
 //!
 //! # Differences from the reference implementation
@@ -222,14 +222,7 @@ impl Ranked {
     }
 
     /// The row of a copula with a heavy tail; `row` has what does not depend on it.
-    fn heavy(
-        &self,
-        samples: &Samples,
-        fit: &Fit,
-        protocol: Protocol,
-        seeds: &Seeds,
-        mut row: Estimate,
-    ) -> Estimate {
+    fn heavy(&self, samples: &Samples, fit: &Fit, protocol: Protocol, seeds: &Seeds, mut row: Estimate) -> Estimate {
         let (rows, widths) = (&samples.rows, self.widths);
         let bias = gaussian::bias(rows.len() as f64, widths.x, widths.y, widths.z);
         let copula = self.copula(&fit.tail, &fit.correlation);
