@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::TrainError;
 use super::protocol::EvaluationConfig;
-use crate::algo::{self, MaddpgConfig};
+use crate::algo::{self, MaddpgConfig, Messages};
 use crate::registry::{RegistryError, Spec};
 use crate::scenario::Scenario;
 
@@ -343,8 +343,29 @@ impl TrainConfig {
         let between = self.update_every / (scenario.steps() as u64).max(1);
         self.envs.get_or_insert(between.clamp(1, 64) as usize);
         self.evaluation.episodes = Some(self.evaluation.episodes());
+        self.resolve_encoders(learners)?;
         self.check()?;
         Ok(self)
+    }
+
+    /// Fills in the shape of the encoders, or refuses one where there are none.
+    fn resolve_encoders(&mut self, learners: usize) -> Result<(), TrainError> {
+        let m = &mut self.maddpg;
+        let fail = |name: &str, message: String| Err(TrainError::Value { name: format!("maddpg.{name}"), message });
+        if m.messages == Messages::Encoder {
+            if learners < 2 {
+                let message = format!("an encoder learns through who hears it, found {learners} learner: take another");
+                return fail("messages", message);
+            }
+            m.message_width.get_or_insert(MaddpgConfig::MESSAGE_WIDTH);
+            m.encoder_hidden.get_or_insert_with(|| MaddpgConfig::ENCODER_HIDDEN.to_vec());
+            return Ok(());
+        }
+        let shapes = [("message_width", m.message_width.is_some()), ("encoder_hidden", m.encoder_hidden.is_some())];
+        match shapes.into_iter().find(|(_, given)| *given) {
+            None => Ok(()),
+            Some((name, _)) => fail(name, "it shapes encoders: set messages = \"encoder\", or leave it out".to_owned()),
+        }
     }
 
     /// Worlds stepped together; 1 before [`TrainConfig::resolve`] where not given.
@@ -371,7 +392,17 @@ impl TrainConfig {
             (name, value >= 0.0 && value.is_finite(), format!("expected a number ≥ 0, found {value}"))
         };
         let [alpha, beta] = self.weights();
+        let layers = |name: &'static str, widths: &[usize]| {
+            let fits = widths.len() <= WIDEST[0] && widths.iter().all(|w| (1..=WIDEST[1]).contains(w));
+            (name, fits, format!("expected at most {} layers of 1 to {} units, found {widths:?}", WIDEST[0], WIDEST[1]))
+        };
         let rules = [
+            layers("maddpg.encoder_hidden", m.encoder_hidden.as_deref().unwrap_or(&[])),
+            (
+                "maddpg.message_width",
+                m.message_width.is_none_or(|w| (1..=WIDEST[1]).contains(&w)),
+                format!("expected 1 to {}, found {}", WIDEST[1], m.message_width.unwrap_or(0)),
+            ),
             positive("steps", self.steps as usize),
             positive("replay", self.replay),
             positive("update_every", self.update_every as usize),
@@ -382,11 +413,7 @@ impl TrainConfig {
             positive("evaluation.episodes", self.evaluation.episodes() as usize),
             positive("maddpg.batch", m.batch.unwrap_or(0)),
             positive("maddpg.hidden", m.hidden.iter().copied().min().unwrap_or(0)),
-            (
-                "maddpg.hidden",
-                m.hidden.len() <= WIDEST[0] && m.hidden.iter().all(|&w| w <= WIDEST[1]),
-                format!("expected at most {} layers of at most {} units, found {:?}", WIDEST[0], WIDEST[1], m.hidden),
-            ),
+            layers("maddpg.hidden", &m.hidden),
             unit("maddpg.gamma", m.gamma),
             unit("maddpg.tau", m.tau),
             rate("maddpg.actor_learning_rate", m.actor_learning_rate),
