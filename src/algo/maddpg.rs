@@ -545,6 +545,7 @@ mod tests {
                 let base = MaddpgConfig { grad_clip, action_penalty, actor_step, messages, ..MaddpgConfig::default() };
                 let config = MaddpgConfig { encoder_hidden, ..base };
                 let mut learner = Maddpg::new(&agents, Activation::Tanh, config, &Seeds::new(4)).unwrap();
+                learner.td_pass(&batch, &[], false); // lays out the critic
                 learner.actor_pass(&batch);
                 let (found, exact) = (&learner.scratch.actor_grads, by_candle(&learner, &batch));
                 assert_eq!(found.len(), exact.len());
@@ -577,6 +578,7 @@ mod tests {
         let mut batch = batch(150, 3);
         let silent = |at: usize| at % 9 % 4 == 0;
         batch.link = (0..9 * 150).map(|at| silent(at) || at % 9 == 5).collect(); // of all messages, 1 → 2 alone arrives
+        learner.td_pass(&batch, &[], false);
         let (_, [actors, encoders]) = learner.actor_pass(&batch);
         assert!(actors > 0.0 && encoders > 0.0);
         let moved: Vec<bool> = (0..3)
@@ -601,7 +603,9 @@ mod tests {
         let batch = batch(150, 2);
         let made = |grad_clip| {
             let config = MaddpgConfig { messages: Messages::Encoder, grad_clip, ..MaddpgConfig::default() };
-            Maddpg::new(&agents, Activation::Tanh, config, &Seeds::new(4)).unwrap()
+            let mut learner = Maddpg::new(&agents, Activation::Tanh, config, &Seeds::new(4)).unwrap();
+            learner.td_pass(&batch, &[], false);
+            learner
         };
         let (mut free, mut bound) = (made(f32::INFINITY), made(1e-3));
         let (_, norms) = free.actor_pass(&batch);

@@ -51,7 +51,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         return Err(Error::from(IoError::Missing(args.run.clone())).into());
     }
     // the prior is not built: the tests need none, and the trace of one may have moved
-    let (config, _) = TrainConfig::parse(&file).map_err(Error::from)?;
+    let config = TrainConfig::parse(&file).map_err(Error::from)?;
     let scenario = scenario::build(&config.scenario).map_err(Error::from)?;
     let team = Trained::load(&args.run, &*scenario, ActionNoise::None).map_err(Error::from)?;
     let trained = team.actors.steps;

@@ -89,6 +89,15 @@ fn hundred_thousand() -> usize {
     100_000
 }
 
+/// What is given beside a configuration file, which may then leave it out.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Given<'a> {
+    /// The algorithm.
+    pub algorithm: Option<&'a str>,
+    /// The scenario.
+    pub scenario: Option<&'a Spec>,
+}
+
 /// Ornstein–Uhlenbeck exploration noise, added to the tanh output and clamped to [−1, 1].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -266,33 +275,55 @@ impl TrainConfig {
         }
     }
 
-    /// Reads a TOML file; a typo is refused with its line, in the tables of plugins too.
+    /// Reads a TOML file, which may leave out what is given beside it; a typo is refused with its line, in the tables of
+    /// plugins too.
     ///
     /// # Errors
     /// [`TrainError::Io`], [`TrainError::Config`].
-    pub fn read(path: &Path) -> Result<Self, TrainError> {
-        let (config, text) = Self::parse(path)?;
-        let refuse = |message: String| TrainError::Config { message, path: path.to_owned() };
+    pub fn read(path: &Path, given: Given<'_>) -> Result<Self, TrainError> {
+        let text = crate::io::read_text(path, LIMIT)?;
+        let config = Self::from_text(&text, path, given)?;
         // a plugin's parameters are its own: what it refuses has no place in the file until it is looked for
-        config.check_plugins().map_err(|error| match line_of(&text, &error.to_string()) {
-            Some(line) => refuse(format!("line {line}: {error}")),
-            None => refuse(error.to_string()),
+        config.check_plugins().map_err(|error| {
+            let line = line_of(&text, &error.to_string());
+            let message = line.map_or_else(|| error.to_string(), |line| format!("line {line}: {error}"));
+            TrainError::Config { message, excerpt: String::new(), path: path.to_owned() }
         })?;
         Ok(config)
     }
 
-    /// Reads a run's own file and its text, without building its scenario and prior: what those need (the trace of a
-    /// prior) may be gone when the run itself is still good.
+    /// Reads a run's own file, without building its scenario and prior: what those need (the trace of a prior) may be
+    /// gone when the run itself is still good.
     ///
     /// # Errors
     /// As [`TrainConfig::read`].
-    pub fn parse(path: &Path) -> Result<(Self, String), TrainError> {
-        let text = crate::io::read_text(path, LIMIT)?;
-        let config = toml::from_str(&text).map_err(|e| TrainError::Config {
-            message: e.to_string().trim().replace('\n', "; "),
-            path: path.to_owned(),
-        })?;
-        Ok((config, text))
+    pub fn parse(path: &Path) -> Result<Self, TrainError> {
+        Self::from_text(&crate::io::read_text(path, LIMIT)?, path, Given::default())
+    }
+
+    fn from_text(text: &str, path: &Path, given: Given<'_>) -> Result<Self, TrainError> {
+        // what is given stands before the text where that does not have it, so that places in the text are known
+        let has = |key: &str| text.parse::<toml::Table>().is_ok_and(|table| table.contains_key(key));
+        let mut before = String::new();
+        if let Some(algorithm) = given.algorithm.filter(|_| !has("algorithm")) {
+            before.push_str(&format!("algorithm = {}\n", toml::Value::from(algorithm)));
+        }
+        if let Some(name) = given.scenario.map(|spec| spec.name.as_str()).filter(|_| !has("scenario")) {
+            before.push_str(&format!("scenario = {}\n", toml::Value::from(name)));
+        }
+        toml::from_str(&format!("{before}{text}")).map_err(|error| {
+            let place = error.span().and_then(|span| place(text, span.start.checked_sub(before.len())?));
+            let (at, excerpt) = match place {
+                Some((line, column, code)) => {
+                    let width = line.to_string().len();
+                    let mark = format!("{:width$} | {:>column$}", "", "^");
+                    (format!("line {line}, column {column}: "), format!("{line} | {code}\n{mark}"))
+                }
+                None => Default::default(),
+            };
+            let message = format!("{at}{}", error.message().trim().replace('\n', "; "));
+            TrainError::Config { message, excerpt, path: path.to_owned() }
+        })
     }
 
     fn check_plugins(&self) -> Result<(), RegistryError> {
@@ -354,7 +385,8 @@ impl TrainConfig {
         let fail = |name: &str, message: String| Err(TrainError::Value { name: format!("maddpg.{name}"), message });
         if m.messages == Messages::Encoder {
             if learners < 2 {
-                let message = format!("an encoder learns through who hears it, found {learners} learner: take another");
+                let message =
+                    format!("an encoder learns through who hears it, found {learners} learner: set \"observation\"");
                 return fail("messages", message);
             }
             m.message_width.get_or_insert(MaddpgConfig::MESSAGE_WIDTH);
@@ -449,6 +481,14 @@ impl TrainConfig {
     pub fn to_toml(&self) -> Result<String, TrainError> {
         toml::to_string(self).map_err(|e| TrainError::Value { name: "config".to_owned(), message: e.to_string() })
     }
+}
+
+/// Line and column (in characters) of a byte of `text`, from 1, and the line itself.
+fn place(text: &str, at: usize) -> Option<(usize, usize, &str)> {
+    let before = text.get(..at)?;
+    let start = before.rfind('\n').map_or(0, |end| end + 1);
+    let line = before.matches('\n').count() + 1;
+    Some((line, before[start..].chars().count() + 1, text[start..].lines().next().unwrap_or("")))
 }
 
 /// The first line of `text` that gives a value to a name which `error` quotes: a key or a plugin.

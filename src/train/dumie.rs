@@ -485,7 +485,7 @@ mod tests {
         // b hears and does 1, −1, 1, …: a shift in time would give equal steps equal negatives
         let sign = |t: usize| if t.is_multiple_of(2) { 1.0 } else { -1.0 };
         let mut e = Episode { steps: 24, link: [true, true, false, true].repeat(25), ..Episode::default() };
-        e.observations = vec![Matrix { data: (0..25).map(sign).collect(), width: 1 }; 2];
+        e.messages = vec![Matrix { data: (0..25).map(sign).collect(), width: 1 }; 2];
         e.actions = vec![Matrix { data: (0..24).map(sign).collect(), width: 1 }; 2];
         for stream in 0..5 {
             let bonus = dumie.bonus_at_rollout(&e, &mut Seeds::new(6).indexed_stream("b", stream));

@@ -55,6 +55,8 @@ pub enum TrainError {
     Config {
         /// What is wrong, with line and column.
         message: String,
+        /// The line of the file and a mark below it, on lines of their own; empty where the place is not known.
+        excerpt: String,
         /// Where.
         path: PathBuf,
     },

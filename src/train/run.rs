@@ -44,6 +44,8 @@ pub struct Report {
     pub next_critic_loss: Option<f64>,
     /// Whether it was stopped before its last step.
     pub interrupted: bool,
+    /// Whether it had taken its last step before: nothing was left to do.
+    pub was_finished: bool,
     /// Files of earlier tests that were removed when the run went on, and that it did not write anew.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub removed: Vec<&'static str>,
@@ -78,6 +80,7 @@ pub fn train(
         Some(path) => Some(crate::storage::create(path, &trainer.manifest(), false)?), // data outlives a run
         None => None,
     };
+    let was_finished = options.resume && trainer.step >= trainer.config.steps;
     // nothing that was there is touched before everything that can be refused has been
     let mut removed = Vec::new();
     let _new = if options.resume {
@@ -118,6 +121,7 @@ pub fn train(
         return_mean: trainer.return_mean(),
         next_critic_loss: trainer.next_critic_loss(),
         interrupted,
+        was_finished,
         removed,
     })
 }
