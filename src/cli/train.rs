@@ -6,12 +6,12 @@ use clap::ValueEnum;
 use serde_json::json;
 
 use super::args::{ScenarioArgs, stop_flag};
+use super::evaluate::print_channels;
 use super::{Outcome, ui};
 use crate::Error;
 use crate::link::LINKS;
 use crate::registry::Spec;
-use crate::train::config::Given;
-use crate::train::{self, Options, Protocol, TrainConfig, TrainError};
+use crate::train::{self, Given, Options, Protocol, TrainConfig, TrainError};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -188,13 +188,15 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
                 ("run", out.clone()),
                 ("steps", report.steps.to_string()),
                 ("updates", report.updates.to_string()),
-                (
-                    &*format!("training return, mean over the last logged {log_every} updates"),
-                    number(report.return_mean),
-                ),
+                (&*format!("training return, last logged {log_every} updates"), number(report.return_mean)),
                 ("loss of next batch", number(report.next_critic_loss)),
             ];
             ui::print_table(&["trained", ""], &rows.map(|(k, v)| vec![k.to_owned(), v]))?;
+            if let Some(test) = &report.test {
+                let team = if protocol == Protocol::Standard { "best" } else { "last" };
+                ui::print(&format!("test of the {team} team, that of step {}", test.trained))?;
+                print_channels(&test.channels)?;
+            }
         }
     }
     if report.was_finished {
@@ -217,7 +219,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         }
         return Ok(Outcome::Interrupted);
     }
-    if protocol == Protocol::Paper {
+    if protocol != Protocol::None {
         ui::say(&format!("next: ccmarl report {out} --out reports/first"));
     } else {
         ui::say(&format!("next: ccmarl evaluate {out} --suite paper"));

@@ -1,20 +1,15 @@
 //! A training run's configuration: the TOML a user writes, checked and with every default filled in.
 
-use std::path::Path;
-
 use serde::{Deserialize, Serialize};
 
 use super::TrainError;
 use super::protocol::EvaluationConfig;
 use crate::algo::{self, MaddpgConfig, Messages};
-use crate::registry::{RegistryError, Spec};
+use crate::registry::Spec;
 use crate::scenario::Scenario;
 
 /// Most hidden layers, and most units in one: what fits in memory many times over.
 const WIDEST: [usize; 2] = [16, 4096];
-
-/// Largest configuration file that is read, bytes.
-const LIMIT: u64 = 1 << 20;
 
 /// Everything a training run depends on. `config.toml` in the run directory is this, fully resolved.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -87,15 +82,6 @@ fn four_million() -> u64 {
 }
 fn hundred_thousand() -> usize {
     100_000
-}
-
-/// What is given beside a configuration file, which may then leave it out.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Given<'a> {
-    /// The algorithm.
-    pub algorithm: Option<&'a str>,
-    /// The scenario.
-    pub scenario: Option<&'a Spec>,
 }
 
 /// Ornstein–Uhlenbeck exploration noise, added to the tanh output and clamped to [−1, 1].
@@ -275,62 +261,6 @@ impl TrainConfig {
         }
     }
 
-    /// Reads a TOML file, which may leave out what is given beside it; a typo is refused with its line, in the tables of
-    /// plugins too.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`], [`TrainError::Config`].
-    pub fn read(path: &Path, given: Given<'_>) -> Result<Self, TrainError> {
-        let text = crate::io::read_text(path, LIMIT)?;
-        let config = Self::from_text(&text, path, given)?;
-        // a plugin's parameters are its own: what it refuses has no place in the file until it is looked for
-        config.check_plugins().map_err(|error| {
-            let line = line_of(&text, &error.to_string());
-            let message = line.map_or_else(|| error.to_string(), |line| format!("line {line}: {error}"));
-            TrainError::Config { message, excerpt: String::new(), path: path.to_owned() }
-        })?;
-        Ok(config)
-    }
-
-    /// Reads a run's own file, without building its scenario and prior: what those need (the trace of a prior) may be
-    /// gone when the run itself is still good.
-    ///
-    /// # Errors
-    /// As [`TrainConfig::read`].
-    pub fn parse(path: &Path) -> Result<Self, TrainError> {
-        Self::from_text(&crate::io::read_text(path, LIMIT)?, path, Given::default())
-    }
-
-    fn from_text(text: &str, path: &Path, given: Given<'_>) -> Result<Self, TrainError> {
-        // what is given stands before the text where that does not have it, so that places in the text are known
-        let has = |key: &str| text.parse::<toml::Table>().is_ok_and(|table| table.contains_key(key));
-        let mut before = String::new();
-        if let Some(algorithm) = given.algorithm.filter(|_| !has("algorithm")) {
-            before.push_str(&format!("algorithm = {}\n", toml::Value::from(algorithm)));
-        }
-        if let Some(name) = given.scenario.map(|spec| spec.name.as_str()).filter(|_| !has("scenario")) {
-            before.push_str(&format!("scenario = {}\n", toml::Value::from(name)));
-        }
-        toml::from_str(&format!("{before}{text}")).map_err(|error| {
-            let place = error.span().and_then(|span| place(text, span.start.checked_sub(before.len())?));
-            let (at, excerpt) = match place {
-                Some((line, column, code)) => {
-                    let width = line.to_string().len();
-                    let mark = format!("{:width$} | {:>column$}", "", "^");
-                    (format!("line {line}, column {column}: "), format!("{line} | {code}\n{mark}"))
-                }
-                None => Default::default(),
-            };
-            let message = format!("{at}{}", error.message().trim().replace('\n', "; "));
-            TrainError::Config { message, excerpt, path: path.to_owned() }
-        })
-    }
-
-    fn check_plugins(&self) -> Result<(), RegistryError> {
-        let scenario = crate::scenario::build(&self.scenario)?;
-        self.prior.as_ref().map_or(Ok(()), |prior| crate::record::build_link(prior, scenario.as_ref()).map(|_| ()))
-    }
-
     /// Fills in what preset and scenario decide, and checks every range.
     ///
     /// # Errors
@@ -481,33 +411,6 @@ impl TrainConfig {
     pub fn to_toml(&self) -> Result<String, TrainError> {
         toml::to_string(self).map_err(|e| TrainError::Value { name: "config".to_owned(), message: e.to_string() })
     }
-}
-
-/// Line and column (in characters) of a byte of `text`, from 1, and the line itself.
-fn place(text: &str, at: usize) -> Option<(usize, usize, &str)> {
-    let before = text.get(..at)?;
-    let start = before.rfind('\n').map_or(0, |end| end + 1);
-    let line = before.matches('\n').count() + 1;
-    Some((line, before[start..].chars().count() + 1, text[start..].lines().next().unwrap_or("")))
-}
-
-/// The first line of `text` that gives a value to a name which `error` quotes: a key or a plugin.
-fn line_of(text: &str, error: &str) -> Option<usize> {
-    let quoted: Vec<&str> = error.split(['`', '"']).skip(1).step_by(2).collect();
-    // "simple_spread: agents: …" quotes nothing: the words before colons are names too
-    let words = error.split(": ").map(|word| word.split(' ').next().unwrap_or(word));
-    let names = quoted.into_iter().chain(words);
-    let gives = |line: &str, name: &str| {
-        let code = line.split('#').next().unwrap_or(line);
-        code.match_indices(name).any(|(at, _)| {
-            let whole = |c: Option<char>| c.is_none_or(|c| !c.is_alphanumeric() && c != '_' && c != '-');
-            whole(code[..at].chars().next_back()) && whole(code[at + name.len()..].chars().next())
-        })
-    };
-    names
-        .filter(|name| !name.is_empty())
-        .find_map(|name| text.lines().position(|line| gives(line, name)))
-        .map(|line| line + 1)
 }
 
 /// A plugin's resolved parameters, which carry its name, as a spec.

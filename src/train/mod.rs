@@ -3,6 +3,7 @@
 mod arrays;
 mod checkpoint;
 pub mod config;
+mod config_file;
 mod difference;
 mod directory;
 pub mod dumie;
@@ -21,10 +22,13 @@ mod warm;
 use std::path::PathBuf;
 
 pub use config::TrainConfig;
+pub use config_file::Given;
 pub use estimator::Estimator;
-pub use evaluate::{EVALUATION_COLUMNS, EvaluationRow, evaluate, evaluation_seed, write_evaluation};
+pub use evaluate::{
+    ChannelSummary, EVALUATION_COLUMNS, EvaluationRow, evaluate, evaluation_seed, summarise, write_evaluation,
+};
 pub use metrics::{METRIC_COLUMNS, METRIC_KEYS, MetricsRow};
-pub use protocol::{EvaluationConfig, Protocol, STANDARD_COLUMNS};
+pub use protocol::{EvaluationConfig, LastTest, Protocol, STANDARD_COLUMNS};
 pub use run::{Options, Progress, Report, train};
 pub use timings::TIMING_COLUMNS;
 pub use trainer::Trainer;

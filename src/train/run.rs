@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::config::TrainConfig;
 use super::trainer::Trainer;
-use super::{TrainError, directory};
+use super::{LastTest, TrainError, directory};
 
 /// How a run is started.
 #[derive(Debug, Default)]
@@ -49,6 +49,9 @@ pub struct Report {
     /// Files of earlier tests that were removed when the run went on, and that it did not write anew.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub removed: Vec<&'static str>,
+    /// What the tests found that belong to the end of the run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub test: Option<LastTest>,
 }
 
 /// Trains as `config` says into the run directory `dir`, which gets `config.toml`, `metrics.parquet`, `timings.parquet`,
@@ -110,9 +113,7 @@ pub fn train(
         sink.finish()?;
     }
     let interrupted = trainer.step < trainer.config.steps;
-    if !interrupted {
-        trainer.test_at_end()?;
-    }
+    let test = if interrupted { None } else { trainer.test_at_end()? };
     removed.retain(|name| !dir.join(name).exists());
     Ok(Report {
         steps: trainer.step,
@@ -123,5 +124,6 @@ pub fn train(
         interrupted,
         was_finished,
         removed,
+        test,
     })
 }

@@ -66,7 +66,7 @@ if "$torch" -c "import torch, safetensors, pyarrow" >/dev/null 2>&1; then
     ccmarl record --scenario simple_spread --policy "run:$work/encoded" --link dropout:0.3 --episodes 60 --force --out "$work/sent" >/dev/null 2>&1
     "$torch" tests/interop/act_in_pytorch.py "$work/encoded/checkpoint/actors.safetensors" "$work/sent"
 else
-    echo "skipped: no PyTorch (CCMARL_TORCH_PYTHON names a python that has it)"
+    echo "skipped: no PyTorch with safetensors and pyarrow (CCMARL_TORCH_PYTHON names a python that has them)"
 fi
 
 # what mpe2 does with a seed that no golden store has, written by Python, played again step by step

@@ -4,8 +4,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use ccmarl::registry::Spec;
-use ccmarl::train::config::Given;
-use ccmarl::train::{EvaluationConfig, Options, Protocol, Report, TrainConfig, Trainer, train};
+use ccmarl::train::{EvaluationConfig, Given, Options, Protocol, Report, TrainConfig, Trainer, train};
 use polars::prelude::{DataFrame, ParquetReader, SerReader as _};
 
 pub(crate) fn config(algorithm: &str, steps: u64) -> TrainConfig {
