@@ -147,7 +147,11 @@ pub(super) fn report_error(error: &anyhow::Error) -> ExitCode {
         return ExitCode::SUCCESS;
     }
     eprintln!("error: {}", crate::io::printable(&format!("{error:#}")));
-    let usage = error.chain().any(|e| e.downcast_ref::<crate::Error>().is_some_and(crate::Error::is_usage));
+    let own = || error.chain().filter_map(|e| e.downcast_ref::<crate::Error>());
+    for line in own().filter_map(crate::Error::excerpt).flat_map(str::lines) {
+        eprintln!("  {}", crate::io::printable(line));
+    }
+    let usage = own().any(crate::Error::is_usage);
     ExitCode::from(if usage { 2 } else { 1 })
 }
 

@@ -16,11 +16,13 @@ const RUN_FILES: [&str; 8] = [
     "timings.parquet",
     EVALUATION_FILE,
     STANDARD_FILE,
-    "mi.parquet",
+    MUTUAL,
     "events.out.tfevents.ccmarl",
     CHECKPOINTS,
 ];
 
+/// Estimates of what the team's messages tell, where somebody put them beside its tables.
+const MUTUAL: &str = "mi.parquet";
 /// The configuration, fully resolved; says that a directory is a run.
 pub(super) const CONFIG: &str = "config.toml";
 pub(super) const CHECKPOINTS: &str = "checkpoint";
@@ -89,13 +91,13 @@ pub(super) fn remove_leftovers(dir: &Path) -> Result<(), TrainError> {
     Ok(())
 }
 
-/// Removes the tests of a run that is about to go on: they are of the team that it had. Returns their names.
+/// Removes tests and estimates of a run that is about to go on: they are of the team that it had. Returns their names.
 pub(super) fn remove_tests(trainer: &Trainer) -> Result<Vec<&'static str>, TrainError> {
     if trainer.tests.best.params.is_empty() {
         io::remove(&trainer.dir.join(CHECKPOINTS).join(checkpoint::BEST))?; // otherwise the next checkpoint's is its
     }
     let there = |name: &&str| trainer.dir.join(name).exists();
-    let names: Vec<_> = [EVALUATION_FILE, STANDARD_FILE].into_iter().filter(there).collect();
+    let names: Vec<_> = [EVALUATION_FILE, STANDARD_FILE, MUTUAL].into_iter().filter(there).collect();
     names.iter().try_for_each(|name| io::remove(&trainer.dir.join(name)))?;
     Ok(names)
 }

@@ -5,6 +5,7 @@ mod allocations;
 mod architecture;
 mod channel;
 mod cli;
+mod encoder;
 mod estimate_mi;
 mod extracts;
 mod figures;
