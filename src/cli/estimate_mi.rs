@@ -8,6 +8,7 @@ use clap::ValueHint;
 use super::args::end_on_signals;
 use super::estimates::{class, place, print, split, writer};
 use super::jobs::{Gathered, gather};
+use super::outputs::Picture;
 use super::{Outcome, heatmap, ui};
 use crate::Error;
 use crate::mi::{self, ESTIMATORS, Estimate, Plan, Protocol};
@@ -168,7 +169,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     end_on_signals()?;
     let plan = plan(args)?;
     let write = args.out.as_deref().map(|path| writer(path, &args.path, args.force)).transpose()?;
-    let plot = args.plot.as_deref().map(|path| heatmap::target(path, args.force)).transpose()?;
+    let plot = args.plot.as_deref().map(|path| Picture::at(path, args.force)).transpose()?;
     if plot.is_some() {
         refuse_undrawable(args)?;
     }
@@ -302,4 +303,3 @@ fn unlagged(args: &Args) -> Result<Vec<Samples>, Error> {
     }
     Ok(sets)
 }
-

@@ -159,8 +159,7 @@ impl Contrast {
         kind: Kind,
         learnt: bool,
     ) -> Estimate {
-        let mut row =
-            Estimate::new(&self.full_name(), &samples.labels, of.mean, Unit::Nats, kind, data.test.len());
+        let mut row = Estimate::new(&self.full_name(), &samples.labels, of.mean, Unit::Nats, kind, data.test.len());
         row.n_effective = of.n_effective;
         if learnt {
             (row.interval_low, row.interval_high) = (Some(of.low), Some(of.high));

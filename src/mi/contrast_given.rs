@@ -70,8 +70,8 @@ fn null([with_y, without]: [(&mut Reader, &Prepared); 2], protocol: Protocol, se
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mi::run::tests::{linear_samples, plan, samples_of};
     use crate::mi::run;
+    use crate::mi::run::tests::{linear_samples, plan, samples_of};
 
     /// x, y and z from three independent normals per row.
     fn samples(n: usize, of: fn([f64; 3]) -> [f64; 3]) -> Samples {

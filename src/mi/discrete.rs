@@ -109,7 +109,8 @@ impl Estimator for Discrete {
         // where most pairs of categories occur once, their frequencies say nothing about the error either
         let crowded = table.pairs() * 2 > n;
         if crowded {
-            warnings.push(format!("{} pairs of categories in {n} samples: no interval; merge categories", table.pairs()));
+            warnings
+                .push(format!("{} pairs of categories in {n} samples: no interval; merge categories", table.pairs()));
         }
         if bias > BIASED {
             warnings.push(format!(
