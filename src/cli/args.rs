@@ -49,12 +49,23 @@ impl ScenarioArgs {
 static STOP: AtomicBool = AtomicBool::new(false);
 /// Whether a command ends by itself when [`STOP`] is raised.
 static ENDS_ITSELF: AtomicBool = AtomicBool::new(false);
+/// Whether a second signal ends the process even so.
+static SECOND_ENDS: AtomicBool = AtomicBool::new(false);
 
 /// A flag that SIGINT and SIGTERM raise, so that a command can end in good order (exit code 4). One per process.
 pub(super) fn stop_flag() -> anyhow::Result<&'static AtomicBool> {
     ENDS_ITSELF.store(true, Ordering::SeqCst);
     handle_signals()?;
     Ok(&STOP)
+}
+
+/// As [`stop_flag`], for commands that lose nothing when a second signal ends the process; a command around this one
+/// that has a [`stop_flag`] goes before.
+pub(super) fn stop_or_end() -> anyhow::Result<&'static AtomicBool> {
+    if !ENDS_ITSELF.load(Ordering::SeqCst) {
+        SECOND_ENDS.store(true, Ordering::SeqCst);
+    }
+    stop_flag()
 }
 
 /// Lets SIGINT and SIGTERM end the process with exit code 4, for commands whose outputs appear whole at their end; a
@@ -66,9 +77,13 @@ pub(super) fn end_on_signals() -> anyhow::Result<()> {
 fn handle_signals() -> anyhow::Result<()> {
     #[expect(clippy::exit, reason = "the handler's thread cannot return to the command's")]
     let handler = || {
-        STOP.store(true, Ordering::SeqCst);
+        let again = STOP.swap(true, Ordering::SeqCst);
         if !ENDS_ITSELF.load(Ordering::SeqCst) {
             super::ui::say("interrupted: nothing was written");
+            std::process::exit(4);
+        }
+        if again && SECOND_ENDS.load(Ordering::SeqCst) {
+            super::ui::say("interrupted again: ended at once");
             std::process::exit(4);
         }
     };

@@ -1,18 +1,20 @@
 //! `ccmarl estimate-mi`: mutual information per link of a store, or between columns of a table.
 
-use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
+use std::sync::Arc;
 
-use anyhow::Context as _;
 use clap::ValueHint;
 
 use super::args::end_on_signals;
+use super::estimates::{class, place, print, split, writer};
+use super::jobs::{Gathered, gather};
+use super::outputs::Picture;
 use super::{Outcome, heatmap, ui};
 use crate::Error;
-use crate::mi::{self, ESTIMATORS, Estimate, Job, JobResult, Kind, Plan, Protocol};
+use crate::mi::{self, ESTIMATORS, Estimate, Plan, Protocol};
 use crate::pairs::{self, PairsError, TableOptions};
 use crate::registry::{Spec, find};
-use crate::schema::{SampleLabels, Samples};
+use crate::schema::Samples;
 use crate::{io, storage};
 
 const EXAMPLES: &str = "\
@@ -28,6 +30,7 @@ Examples:
   ccmarl estimate-mi table.csv --x job --y city --estimator discrete --format csv
   ccmarl estimate-mi table.csv --x a --y b --time t --out result.json
 
+Interrupted (Ctrl-C), it shows and writes the rows that are finished and exits 4.
 For a store: x is the message that the sender sent, y the action of the receiver at the same step, per ordered link,
 delivered and lost apart. Values are in nats unless the unit says jsd. p: episodes permuted.
 In a CSV an empty cell and NaN are missing. Columns of words are categories: discrete and ksg-mixed take them.
@@ -67,7 +70,7 @@ pub(super) struct Args {
     /// Rows from x to y, never across the edge of an episode: 3, or 0,1,5, or 0..10 (both ends included)
     #[arg(long, value_name = "LAGS", default_value = "0", value_parser = lags)]
     lag: Lags,
-    /// Table: columns of z; x and y are compared given z (gaussian, gcmi, ksg1, ksg-mixed, discrete)
+    /// Table: columns of z; x and y are compared given z (auto, gaussian, gcmi, ksg1, ksg-mixed, discrete, infonce)
     #[arg(long, value_name = "COLUMNS", value_delimiter = ',', requires = "table")]
     given: Vec<String>,
     /// Table: rows with the same value in this column are one episode
@@ -121,7 +124,7 @@ pub(super) fn estimators() -> String {
 }
 
 /// Rows from x to y.
-type Lags = std::sync::Arc<[usize]>;
+type Lags = Arc<[usize]>;
 
 /// Reads `3`, `0,1,5` or `0..10`.
 fn lags(text: &str) -> Result<Lags, String> {
@@ -163,27 +166,29 @@ enum Form {
     Parquet,
 }
 
-/// A job that gave no rows, and why.
-type Failure = (Job, mi::MiError);
-
-/// A form of output file.
-type Write = fn(&[Estimate]) -> Result<Vec<u8>, String>;
-
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     end_on_signals()?;
     let plan = plan(args)?;
     let write = args.out.as_deref().map(|path| writer(path, &args.path, args.force)).transpose()?;
-    let plot = args.plot.as_deref().map(|path| heatmap::target(path, args.force)).transpose()?;
+    let plot = args.plot.as_deref().map(|path| Picture::at(path, args.force)).transpose()?;
     if plot.is_some() {
         refuse_undrawable(args)?;
     }
-    let samples = samples(args)?;
-    let threads = usize::from(args.threads);
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().context("could not start threads")?;
-    let bar = ui::progress((samples.len() * plan.estimators.len()) as u64, "estimating");
-    let results = pool.install(|| mi::run(&samples, &plan, &|| bar.inc(1)));
-    bar.finish_and_clear();
-    let (mut rows, failures) = split(results)?;
+    let samples = Arc::new(samples(args)?);
+    let plan = Arc::new(plan);
+    let total = samples.len() * plan.estimators.len();
+    let (own_samples, own_plan) = (Arc::clone(&samples), Arc::clone(&plan));
+    let Gathered { told, interrupted } = gather(args.threads, total, "estimating", move |stop, tell| {
+        mi::run_each(&own_samples, &own_plan, stop, &|place, result| tell((place, result)));
+    })?;
+    if interrupted {
+        let done = told.len();
+        ui::say(&format!("interrupted: {done} of {total} estimates are finished, and only these are shown"));
+        if told.iter().all(|(_, result)| result.rows.is_err()) {
+            return Ok(Outcome::Interrupted);
+        }
+    }
+    let (mut rows, failures) = split(mi::in_order(told, &plan))?;
     if args.unit == InUnit::Bits {
         rows = rows.into_iter().map(Estimate::in_bits).collect();
     }
@@ -199,10 +204,15 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         Form::Parquet => ui::print_bytes(&mi::to_parquet(&rows).map_err(anyhow::Error::msg)?),
     };
     // after the results, which a picture that cannot be drawn must not take away, and even if nobody reads them
-    plot.map_or(Ok(()), |target| heatmap::draw(&rows, &target))?;
+    if !interrupted {
+        plot.map_or(Ok(()), |target| heatmap::draw(&rows, &target))?;
+    }
     printed?;
     for (job, error) in &failures {
         ui::say(&format!("warning: no {} for {}: {error}", job.estimator, place(&job.labels)));
+    }
+    if interrupted {
+        return Ok(Outcome::Interrupted);
     }
     let warned = rows.iter().filter(|r| r.warnings.iter().any(|w| !w.starts_with(mi::NOTE))).count() + failures.len();
     anyhow::ensure!(!args.strict || warned == 0, "{warned} results carry warnings, and --strict was given");
@@ -240,27 +250,6 @@ pub(super) fn named(names: &[String]) -> Result<Vec<mi::Named>, Error> {
         }
     }
     Ok(estimators)
-}
-
-fn writer(path: &Path, input: &Path, force: bool) -> anyhow::Result<Write> {
-    let real = |p: &Path| p.canonicalize().ok();
-    if real(path).is_some() && real(path) == real(input) {
-        let message = format!("--out would replace the input: {}", path.display());
-        return Err(Error::Usage(message).into());
-    }
-    io::refuse_existing(path, force).map_err(Error::from)?;
-    storage::refuse_within_store(path).map_err(Error::from)?;
-    let forms: [(&str, Write); 3] = [("json", mi::to_json), ("csv", mi::to_csv), ("parquet", mi::to_parquet)];
-    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
-    let form = forms.iter().find(|(name, _)| extension.as_deref() == Some(*name));
-    let usage = || {
-        Error::Usage(format!("--out: expected a name that ends in .json, .csv or .parquet, found {}", path.display()))
-    };
-    let write = form.map(|(_, write)| *write).ok_or_else(usage)?;
-    if path.symlink_metadata().is_ok() && !mi::is_estimates(path) {
-        return Err(Error::from(io::IoError::Foreign(path.to_owned())).into());
-    }
-    Ok(write)
 }
 
 fn samples(args: &Args) -> Result<Vec<Samples>, Error> {
@@ -314,100 +303,4 @@ fn unlagged(args: &Args) -> Result<Vec<Samples>, Error> {
         }
     }
     Ok(sets)
-}
-
-/// All rows, and the jobs that gave none; an error when no job gave any.
-fn split(results: Vec<JobResult>) -> Result<(Vec<Estimate>, Vec<Failure>), Error> {
-    let (mut rows, mut failures) = (Vec::new(), Vec::new());
-    for JobResult { job, rows: result } in results {
-        match result {
-            Ok(found) => rows.extend(found),
-            Err(error) => failures.push((job, error)),
-        }
-    }
-    match failures.pop() {
-        Some((_, error)) if rows.is_empty() => Err(error.into()),
-        last => {
-            failures.extend(last);
-            Ok((rows, failures))
-        }
-    }
-}
-
-fn class(delivered: bool) -> &'static str {
-    if delivered { "delivered" } else { "lost" }
-}
-
-/// `agent_0 → agent_1 delivered`, or `a,b → c`.
-fn place(labels: &SampleLabels) -> String {
-    match (&labels.sender, &labels.receiver, labels.delivered) {
-        (Some(sender), Some(receiver), Some(delivered)) => {
-            let lag = labels.y.rsplit_once("[+").map_or(String::new(), |(_, lag)| format!(" [+{lag}"));
-            format!("{sender} → {receiver} {}{lag}", class(delivered))
-        }
-        _ => match &labels.given {
-            Some(given) => format!("{} ; {} | {given}", labels.x, labels.y),
-            None => format!("{} ; {}", labels.x, labels.y),
-        },
-    }
-}
-
-/// Four decimals, and no minus sign before a zero.
-pub(super) fn decimals(value: f64) -> String {
-    let text = format!("{value:.4}");
-    if text == "-0.0000" { "0.0000".to_owned() } else { text }
-}
-
-fn print(rows: &[Estimate], samples: &[Samples]) -> anyhow::Result<()> {
-    let mut warnings: BTreeMap<&str, Vec<String>> = BTreeMap::new();
-    let mut lines = Vec::new();
-    let mut places = rows.iter().map(|row| {
-        samples.iter().map(|s| &s.labels).find(|l| {
-            (&l.x, &l.y, &l.sender, &l.receiver) == (&row.x, &row.y, &row.sender, &row.receiver)
-                && l.delivered == row.delivered
-        })
-    });
-    let mut before = String::new();
-    for row in rows {
-        let here = places.next().flatten().map(place).unwrap_or_default();
-        let sign = match row.kind {
-            Kind::LowerBound => "≥ ",
-            Kind::UpperBound => "≤ ",
-            Kind::Estimate => "",
-        };
-        let value = if row.value.is_infinite() {
-            "infinite (copy)".to_owned()
-        } else {
-            format!("{sign}{}", decimals(row.value))
-        };
-        let interval = row.interval_low.zip(row.interval_high);
-        lines.push(vec![
-            if here == before { String::new() } else { here.clone() },
-            row.estimator.clone(),
-            value,
-            interval.map_or_else(String::new, |(low, high)| format!("{} … {}", decimals(low), decimals(high))),
-            row.unit.name().to_owned(),
-            row.p_value.map_or_else(String::new, |p| format!("{p:.3}")),
-            row.n.to_string(),
-            format!("{:.0}", row.n_effective),
-        ]);
-        for warning in &row.warnings {
-            let named = warnings.entry(warning).or_default();
-            if !named.contains(&here) {
-                named.push(here.clone());
-            }
-        }
-        before = here;
-    }
-    ui::print_table(&["samples", "estimator", "value", "95 % interval", "unit", "p", "n", "n_eff"], &lines)?;
-    if samples.iter().any(|s| s.labels.group == "row") {
-        ui::print("each row was taken as independent; give --group or --time if rows belong together")?;
-    }
-    for (warning, places) in warnings {
-        let shown = places.iter().take(3).map(String::as_str).collect::<Vec<_>>().join(", ");
-        let more = if places.len() > 3 { format!(" and {} more", places.len() - 3) } else { String::new() };
-        let kind = if warning.starts_with(mi::NOTE) { "" } else { "warning: " };
-        ui::print(&format!("{kind}{} ({}{more})", io::printable(warning), io::printable(&shown)))?;
-    }
-    Ok(())
 }

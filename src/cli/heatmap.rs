@@ -1,35 +1,14 @@
 //! A heat map of estimates: links of a store, or pairs of a table's columns.
 
-use std::path::{Path, PathBuf};
-
-use super::{outputs, ui};
-use crate::Error;
-use crate::figure::{self, Cell, Data, FIGURES};
-use crate::io::read_bytes;
+use super::outputs::Picture;
+use super::ui;
+use crate::figure::{Cell, Data};
 use crate::mi::Estimate;
-use crate::registry::find;
-
-/// Where the figure goes.
-pub(super) struct Target {
-    path: PathBuf,
-    is_png: bool,
-}
-
-/// Checks the name before anything is computed.
-pub(super) fn target(path: &Path, force: bool) -> Result<Target, Error> {
-    let ends = |with: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(with));
-    if !ends("svg") && !ends("png") {
-        let message = format!("--plot: expected a name that ends in .svg or .png, found {}", path.display());
-        return Err(Error::Usage(message));
-    }
-    outputs::check(path, force, outputs::is_picture)?;
-    Ok(Target { path: path.to_owned(), is_png: ends("png") })
-}
 
 /// Draws the rows of the first estimator that has a finite value; where none has, it says so.
-pub(super) fn draw(rows: &[Estimate], target: &Target) -> anyhow::Result<()> {
+pub(super) fn draw(rows: &[Estimate], target: &Picture) -> anyhow::Result<()> {
     let Some(first) = rows.iter().find(|r| r.value.is_finite()) else {
-        ui::say(&format!("note: no finite value to draw: {}", target.path.display()));
+        ui::say(&format!("note: no finite value to draw: {}", target.path().display()));
         return Ok(());
     };
     let of_links = first.sender.is_some();
@@ -69,20 +48,12 @@ pub(super) fn draw(rows: &[Estimate], target: &Target) -> anyhow::Result<()> {
         axes: if of_links { <[String; 2]>::default() } else { ["column".to_owned(), "column".to_owned()] },
         ..Data::default()
     };
-    let entry = find("figure", FIGURES, "mi-heatmap")?;
-    if target.is_png {
-        let folder = tempfile::tempdir()?;
-        let whole = folder.path().join("figure.png");
-        figure::png(entry, &data, &whole)?;
-        outputs::write_png(&target.path, &read_bytes(&whole, u64::MAX - 1).map_err(Error::from)?)?;
-    } else {
-        outputs::write_svg(&target.path, figure::svg(entry, &data)?)?;
-    }
+    target.draw("mi-heatmap", &data)?;
     ui::say(&format!(
         "drew {} values of {}: {}",
         rows.iter().filter(|r| r.estimator == first.estimator).count(),
         first.estimator,
-        target.path.display()
+        target.path().display()
     ));
     Ok(())
 }

@@ -17,7 +17,8 @@
 //!
 //! # Parameters
 //!
-//! None. Kind and interval are those of the chosen row. The p-value is the smallest of those asked times their number
+//! None. Kind and interval are those of the chosen row; where a critic that learned nothing is the largest with its 0, the interval of
+//! the next, reaching to 0. The p-value is the smallest of those asked times their number
 //! (Bonferroni), at most 1.
 //!
 //! # When it fails
@@ -93,10 +94,7 @@ impl Estimator for Auto {
         let asked = rows.len() as f64;
         let least = rows.iter().map(|r| r.p_value).try_fold(1.0, |least: f64, p| Some(least.min(p?)));
         let values = rows.iter().map(|r| format!("{} {:.3}", r.estimator, r.value)).collect::<Vec<_>>().join(", ");
-        let Some(mut row) = rows.into_iter().reduce(|best, next| if next.value > best.value { next } else { best })
-        else {
-            return Ok(Vec::new());
-        };
+        let Some(mut row) = largest(rows) else { return Ok(Vec::new()) };
         let others = if asked > 1.0 { format!(", the largest of {values}") } else { String::new() };
         row.warnings.insert(0, format!("{NOTE}{} chosen: {}{others}", row.estimator, choice.why));
         "auto".clone_into(&mut row.estimator);
@@ -111,6 +109,25 @@ impl Estimator for Auto {
     fn takes_given(&self) -> bool {
         true
     }
+}
+
+/// The row with the largest value. One without an interval (a critic that learned nothing, whose 0 is a floor) takes the
+/// interval and the warnings of the next, reaching to its value.
+fn largest(mut rows: Vec<Estimate>) -> Option<Estimate> {
+    let place = |rows: &[Estimate]| {
+        let places = 0..rows.len();
+        places.reduce(|best, next| if rows[next].value > rows[best].value { next } else { best })
+    };
+    let mut row = rows.remove(place(&rows)?);
+    if row.interval_low.is_none()
+        && row.value.is_finite()
+        && let Some(next) = place(&rows).map(|at| rows.swap_remove(at))
+    {
+        row.interval_low = next.interval_low.map(|low| low.min(row.value));
+        row.interval_high = next.interval_high.map(|high| high.max(row.value));
+        (row.warnings, row.n, row.n_effective) = (next.warnings, next.n, next.n_effective);
+    }
+    Some(row)
 }
 
 fn choose(samples: &Samples) -> Choice {
@@ -188,6 +205,24 @@ mod tests {
         words.y = Arc::new(Columns { words: vec![true], ..(*words.y).clone() });
         assert_eq!(names(&words), ["ksg-mixed"]);
         assert_eq!(choose(&words).why, "words beside numbers");
+    }
+
+    #[test]
+    fn the_largest_row_has_an_interval_that_holds_it() {
+        let labels = crate::schema::SampleLabels::default();
+        let row = |name: &str, value: f64, ends: Option<(f64, f64)>| {
+            let mut row = Estimate::new(name, &labels, value, crate::mi::Unit::Nats, crate::mi::Kind::Estimate, 9);
+            (row.interval_low, row.interval_high) = ends.unzip();
+            row
+        };
+        let rows = [row("a", -0.2, Some((-0.3, -0.1))), row("b", -0.1, Some((-0.2, -0.05))), row("c", 0.0, None)];
+        let found = largest(rows.to_vec()).unwrap();
+        assert_eq!((found.estimator.as_str(), found.interval_low, found.interval_high), ("c", Some(-0.2), Some(0.0)));
+        assert_eq!(largest(rows[..2].to_vec()).unwrap(), rows[1]);
+        assert_eq!(largest(vec![rows[2].clone()]).unwrap().interval_low, None);
+        let copy = [row("a", 1.0, Some((0.9, 1.1))), row("b", f64::INFINITY, None)];
+        assert_eq!(largest(copy.to_vec()).unwrap().interval_low, None);
+        assert!(largest(Vec::new()).is_none());
     }
 
     #[test]

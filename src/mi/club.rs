@@ -21,7 +21,8 @@
 //! # When it fails
 //!
 //! It is loose: ρ²/(1 − ρ²) for normals with the exact q, 3.1 times the information at ρ = 0.75. With a poor q it is no
-//! upper bound at all: when q is worse than r (`club-fit` < 0), or another row's lower bound lies above it, it says so.
+//! upper bound at all: when q is worse than r (`club-fit` < 0), no better than r, or another row's lower bound lies above it,
+//! it says so. A q that never beats r on the validation part stays r: all values are 0, and have no interval.
 //!
 //! # Reference
 //!
@@ -33,7 +34,7 @@
 //! permutation; the log-variance is not confined to (−1, 1). The leave-one-out mean runs over at most 512 others.
 
 use super::conditional::{ConditionalTape, GaussianConditional};
-use super::fit::{Fit, Model, fit, silence};
+use super::fit::{Fit, Model, fit, nothing_learnt, silence};
 use super::prepare::{Prepared, gather, prepare, tied};
 use super::{
     Build, Estimate, Estimator, Kind, MiError, Protocol, Unit, block_interval, losses, p_value, permuted_rows,
@@ -119,6 +120,8 @@ pub(super) struct Fitted<'a> {
     pub(super) data: Prepared,
     pub(super) held: Held,
     warnings: Vec<String>,
+    /// Whether q is another than the margin.
+    learnt: bool,
 }
 
 impl<'a> Fitted<'a> {
@@ -130,7 +133,7 @@ impl<'a> Fitted<'a> {
             grad_mu: Vec::new(),
             grad_logvar: Vec::new(),
         };
-        let Fit { params, .. } = fit(&mut model, &data, seeds).ok_or_else(|| diverged(samples))?;
+        let Fit { params, steps, .. } = fit(&mut model, &data, seeds).ok_or_else(|| diverged(samples))?;
         let held = Held::new(&mut model, &params, samples, &data);
         let fit_gain = block_interval(&held.gain(&data), &data.test_blocks);
         let mut warnings = data.warnings.clone();
@@ -138,7 +141,17 @@ impl<'a> Fitted<'a> {
         if fit_gain.mean < -0.01 && fit_gain.high < 0.0 {
             warnings.push(format!("poor q: {:.3} nats worse than the margin on held-out episodes", -fit_gain.mean));
         }
-        Ok(Self { samples, data, held, warnings })
+        let learnt = steps > 0;
+        if !learnt {
+            warnings.push(nothing_learnt("q"));
+        } else if fit_gain.low <= 0.0 {
+            warnings.push(
+                "q fits no better than the margin: an upper bound only if there is no dependence that a normal q cannot \
+                 show; compare ksg"
+                    .to_owned(),
+            );
+        }
+        Ok(Self { samples, data, held, warnings, learnt })
     }
 
     /// A row from the contributions of the test samples.
@@ -155,7 +168,9 @@ impl<'a> Fitted<'a> {
         }
         let n = self.data.test.len();
         let mut row = Estimate::new(name, &self.samples.labels, of.mean, Unit::Nats, kind, n);
-        (row.interval_low, row.interval_high) = (Some(of.low), Some(of.high));
+        if self.learnt {
+            (row.interval_low, row.interval_high) = (Some(of.low), Some(of.high));
+        }
         row.n_effective = of.n_effective;
         row.p_value = p;
         row.warnings.clone_from(&self.warnings);

@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::bounds::{Objective, infonce};
-use super::fit::{Fit, Model, fit};
+use super::fit::{Fit, Model, fit, nothing_learnt};
 use super::prepare::{Prepared, gather, prepare, tied};
 use super::scorer::{CriticKind, Scorer};
 use super::{
@@ -92,10 +92,29 @@ impl Model for Trainee {
     }
 }
 
+/// A trained critic on held-out rows.
+pub(super) struct Reader {
+    pub(super) scorer: Scorer,
+    pub(super) params: Vec<f32>,
+    /// Whether it beat T = 0 on the validation part.
+    pub(super) learnt: bool,
+    /// Contributions of the test rows, whose mean is the value.
+    pub(super) values: Vec<f64>,
+    pub(super) of: Interval,
+    pub(super) warnings: Vec<String>,
+}
+
 impl Contrast {
-    /// The row.
-    pub(super) fn row(&self, samples: &Samples, protocol: Protocol, seeds: &Seeds) -> Result<Estimate, MiError> {
-        let data = prepare(samples, seeds)?;
+    /// The name of the row.
+    pub(super) fn full_name(&self) -> String {
+        match self.critic {
+            CriticKind::Separable => self.name.to_owned(),
+            CriticKind::Concatenated => format!("{}:concatenated", self.name),
+        }
+    }
+
+    /// Trains a critic and reads it on the test part; `None` when no value was finite.
+    pub(super) fn read(&self, data: &Prepared, seeds: &Seeds) -> Option<Reader> {
         let mut model = Trainee {
             scorer: Scorer::new(self.critic, data.x_width, data.y_width),
             objective: self.objective,
@@ -103,35 +122,50 @@ impl Contrast {
             grad_positive: Vec::new(),
             grad_negative: Vec::new(),
         };
-        let diverged = || MiError::Diverged { columns: format!("{} and {}", samples.labels.x, samples.labels.y) };
-        let Fit { params, steps, .. } = fit(&mut model, &data, seeds).ok_or_else(diverged)?;
+        let Fit { params, steps, .. } = fit(&mut model, data, seeds)?;
+        let mut scorer = model.scorer;
         let held_out = data.train.len().min(data.test.len());
         // a critic held to the range of its validation scores is a critic too, and stays sane far from all data
         let looked = &data.validation[..data.validation.len().min(VALIDATED)];
-        let validated = self.held(&mut model.scorer, &params, &data, looked, ANY, seeds);
-        let mut held = |rows: &[u32]| self.held(&mut model.scorer, &params, &data, rows, validated.range, seeds);
+        let validated = self.held(&mut scorer, &params, data, looked, ANY, seeds);
+        let mut held = |rows: &[u32]| self.held(&mut scorer, &params, data, rows, validated.range, seeds);
         let trained_on = held(&data.train[..held_out]).values(self.reading);
         let trained_on = trained_on.iter().sum::<f64>() / held_out as f64;
         let held = held(&data.test);
-        let of = block_interval(&held.values(self.reading), &data.test_blocks);
-        if !of.mean.is_finite() {
-            return Err(diverged());
-        }
-        let name = match self.critic {
-            CriticKind::Separable => self.name.to_owned(),
-            CriticKind::Concatenated => format!("{}:concatenated", self.name),
-        };
-        let mut row = Estimate::new(&name, &samples.labels, of.mean, Unit::Nats, self.kind, data.test.len());
+        let values = held.values(self.reading);
+        let of = block_interval(&values, &data.test_blocks);
+        let mut warnings = self.warnings(&held, trained_on, of);
+        warnings.extend((steps == 0).then(|| nothing_learnt("the critic")));
+        of.mean.is_finite().then_some(Reader { scorer, params, learnt: steps > 0, values, of, warnings })
+    }
+
+    /// The row.
+    pub(super) fn row(&self, samples: &Samples, protocol: Protocol, seeds: &Seeds) -> Result<Estimate, MiError> {
+        let data = prepare(samples, seeds)?;
+        let mut read = self.read(&data, seeds).ok_or_else(|| diverged(samples))?;
+        let mut row = self.row_of(samples, &data, read.of, self.kind, read.learnt);
+        row.p_value = null(&mut read.scorer, &read.params, samples, &data, protocol, seeds);
+        row.warnings.extend(tied(samples));
+        row.warnings.extend(read.warnings);
+        Ok(row)
+    }
+
+    /// A row with its value, and with an interval if anything was learnt.
+    pub(super) fn row_of(
+        &self,
+        samples: &Samples,
+        data: &Prepared,
+        of: Interval,
+        kind: Kind,
+        learnt: bool,
+    ) -> Estimate {
+        let mut row = Estimate::new(&self.full_name(), &samples.labels, of.mean, Unit::Nats, kind, data.test.len());
         row.n_effective = of.n_effective;
-        if steps > 0 || self.kind != Kind::Estimate {
-            // an estimate of T = 0 says nothing about the truth
+        if learnt {
             (row.interval_low, row.interval_high) = (Some(of.low), Some(of.high));
         }
-        row.p_value = null(&mut model.scorer, &params, samples, &data, protocol, seeds);
         row.warnings.clone_from(&data.warnings);
-        row.warnings.extend(tied(samples));
-        row.warnings.extend(self.warnings(&held, trained_on, of));
-        Ok(row)
+        row
     }
 
     fn warnings(&self, held: &Held, trained_on: f64, of: Interval) -> Vec<String> {
@@ -249,6 +283,11 @@ impl Held {
         let most = self.exponential.iter().copied().fold(0.0, f64::max);
         most / (self.mean * self.exponential.len() as f64)
     }
+}
+
+/// No value was finite.
+pub(super) fn diverged(samples: &Samples) -> MiError {
+    MiError::Diverged { columns: format!("{} and {}", samples.labels.x, samples.labels.y) }
 }
 
 /// Whole test episodes permuted, critic kept. The second means do not change, so E\[T\] is compared.

@@ -102,6 +102,15 @@ impl Table {
         self.joint.len() as f64 - (x + y) as f64 + 1.0
     }
 
+    /// Σ p(x,y)²/p(x)p(y): 1 without dependence, the number of categories when x determines y and y x.
+    pub(super) fn association(&self) -> f64 {
+        let term = |&((a, b), count): &((u32, u32), u32)| {
+            let product = f64::from(self.x[a as usize]) * f64::from(self.y[b as usize]);
+            f64::from(count) * f64::from(count) / product
+        };
+        self.joint.iter().map(term).sum()
+    }
+
     /// Pairs of categories that occur.
     pub(super) fn pairs(&self) -> usize {
         self.joint.len()

@@ -14,9 +14,12 @@
 //!
 //! # Parameters
 //!
-//! None. Both rows carry the same interval, around `discrete-mm`: its error is the spread of the local terms over
-//! whole episodes, joined with √((`K_xy` − `K_x` − `K_y` + 1)/2)/n, which remains when there is no dependence. The p-value
-//! permutes whole episodes; given z, x within equal z, if every sample is its own episode.
+//! None. Both intervals cover the truth. That of `discrete-mm` holds all I that the corrected value lies within t standard errors
+//! of, the variance growing with I: the spread of the local terms over whole episodes, joined with
+//! √((`K_xy` − `K_x` − `K_y` + 1)/2 + φ²)/n, φ² = Σ p̂(x,y)²/p̂(x)p̂(y) − 1, which is the second order of the same expansion and
+//! remains when the local terms do not vary: without dependence, and in a copy. That of `discrete` reaches up to its own
+//! value. `discrete-mm` is held to ln of the fewer categories of x and y, and to minus that remaining error. The p-value permutes whole
+//! episodes; given z, x within equal z, if every sample is its own episode.
 //!
 //! # When it fails
 //!
@@ -34,12 +37,12 @@
 
 use super::counts::{Categories, Table};
 use super::given::NO_NULL;
-use super::interval::{block_interval, t_quantile};
+use super::interval::{Scatter, block_interval, t_quantile};
 use super::part::Part;
 use super::{Build, Estimate, Estimator, Kind, MiError, Protocol, Unit, p_value};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
-use crate::schema::Samples;
+use crate::schema::{Columns, Samples};
 
 /// The registry's entry.
 pub(super) const ENTRY: Entry<Build> = Entry {
@@ -52,6 +55,9 @@ pub(super) const ENTRY: Entry<Build> = Entry {
 
 /// Bias in nats from which it is worth a warning.
 const BIASED: f64 = 0.02;
+
+/// Error of the local terms in nats under which they do not vary.
+const FLAT: f64 = 1e-12;
 
 struct Discrete;
 
@@ -98,15 +104,13 @@ impl Estimator for Discrete {
         if null.is_none() {
             warnings.push(NO_NULL.to_owned());
         }
-        for (distinct, label) in [(distinct_x, &labels.x), (distinct_y, &labels.y)] {
-            if distinct > 2 && distinct * 2 > n {
-                warnings.push(format!("{label} has {distinct} values in {n} samples: take ksg for continuous columns"));
-            }
-        }
+        let sides = [(distinct_x, &samples.x, &labels.x), (distinct_y, &samples.y, &labels.y)];
+        warnings.extend(sides.into_iter().filter_map(|(distinct, columns, label)| sparse(distinct, n, columns, label)));
         // where most pairs of categories occur once, their frequencies say nothing about the error either
         let crowded = table.pairs() * 2 > n;
         if crowded {
-            warnings.push(format!("{} pairs of categories in {n} samples: no interval", table.pairs()));
+            warnings
+                .push(format!("{} pairs of categories in {n} samples: no interval; merge categories", table.pairs()));
         }
         if bias > BIASED {
             warnings.push(format!(
@@ -116,20 +120,25 @@ impl Estimator for Discrete {
         if local.blocks < 10 {
             warnings.push(format!("few blocks: the interval rests on {} episodes", local.blocks));
         }
-        let remains = libm::sqrt(degrees.max(0.0) / 2.0) / n as f64;
-        let half = libm::hypot(local.error, remains) * t_quantile(local.blocks);
+        // terms that do not vary cannot tell how many samples are independent
+        let independent = if local.error > FLAT { local.n_effective } else { local.blocks as f64 };
+        let second = 0.5 * degrees + table.association() - strata as f64;
+        let chance = libm::sqrt(second.max(0.0)) / independent;
+        let scatter = Scatter { seen: value, error: local.error, chance, n: independent };
+        let corrected = value - bias;
+        let (low, high) = scatter.around(corrected, t_quantile(local.blocks));
         let row = |name: &str, value: f64| {
             let mut row = Estimate::new(name, labels, value, Unit::Nats, Kind::Estimate, n);
-            row.n_effective = local.n_effective;
+            row.n_effective = independent;
             row.p_value = p_value(table.information(), null.as_deref().unwrap_or_default());
             if local.blocks > 1 && !crowded {
-                (row.interval_low, row.interval_high) =
-                    (Some(local.mean - bias - half), Some(local.mean - bias + half));
+                (row.interval_low, row.interval_high) = (Some(low.min(value)), Some(high.max(value)));
             }
             row.warnings.clone_from(&warnings);
             row
         };
-        Ok(vec![row("discrete", value), row("discrete-mm", value - bias)])
+        let most = libm::log(distinct_x.min(distinct_y) as f64);
+        Ok(vec![row("discrete", value), row("discrete-mm", corrected.clamp(-chance, most))])
     }
 
     fn takes_words(&self) -> bool {
@@ -139,6 +148,19 @@ impl Estimator for Discrete {
     fn takes_given(&self) -> bool {
         true
     }
+}
+
+/// Says when nearly every sample is a category of its own, and what to do.
+fn sparse(distinct: usize, n: usize, columns: &Columns, label: &str) -> Option<String> {
+    if distinct <= 2 || distinct * 2 <= n {
+        return None;
+    }
+    let advice = if (0..columns.width()).any(|c| columns.is_words(c)) {
+        "merge categories"
+    } else {
+        "take ksg for continuous columns"
+    };
+    Some(format!("{label} has {distinct} values in {n} samples: {advice}"))
 }
 
 #[cfg(test)]
@@ -167,8 +189,8 @@ mod tests {
         let copy = samples_of(&column(&[0, 0, 1, 1, 0, 0, 1, 1]), &column(&[5, 5, 2, 2, 5, 5, 2, 2]));
         let [plug_in, corrected] = both(&copy);
         assert!((plug_in.value - 2f64.ln()).abs() < 1e-12);
-        // two pairs, two and two categories: K_xy − K_x − K_y + 1 = −1
-        assert!((corrected.value - 2f64.ln() - 1.0 / 16.0).abs() < 1e-12);
+        // two pairs, two and two categories: K_xy − K_x − K_y + 1 = −1, and two values have no more than ln 2
+        assert_eq!(corrected.value, 2f64.ln());
         assert_eq!((plug_in.estimator.as_str(), corrected.estimator.as_str()), ("discrete", "discrete-mm"));
     }
 
@@ -186,6 +208,10 @@ mod tests {
             warnings.contains("few samples per pair of categories: the plug-in value is about 0.250"),
             "{warnings}"
         );
+        let mut words = samples_of(&x, &y);
+        words.x = std::sync::Arc::new(Columns { words: vec![true], ..(*words.x).clone() });
+        let warnings = both(&words)[0].warnings.join("; ");
+        assert!(warnings.contains("x has 40 values in 40 samples: merge categories"), "{warnings}");
         let constant = Discrete.estimate(&samples_of(&x, &column(&[1; 40])), &Protocol::default(), &Seeds::new(1));
         assert_eq!(constant.unwrap_err(), MiError::Constant { column: "y".to_owned() });
         let one = Discrete.estimate(&samples_of(&x[..1], &y[..1]), &Protocol::default(), &Seeds::new(1));
@@ -209,8 +235,8 @@ mod tests {
             entropy -= both / 2000.0 * (both / alone).ln();
         }
         assert!((plug_in.value - entropy).abs() < 1e-12, "{} against {entropy}", plug_in.value);
-        // 4 triples, 4 and 4 pairs, 2 strata: −2/2n
-        assert!((corrected.value - plug_in.value - 2.0 / 4000.0).abs() < 1e-12);
+        // 4 triples, 4 and 4 pairs, 2 strata: −2/2n; no more than ln 2
+        assert!((corrected.value - (plug_in.value + 2.0 / 4000.0).min(2f64.ln())).abs() < 1e-12);
         assert_eq!(plug_in.p_value, Some(0.01));
         // both are noisy copies of the parity: dependent, but not given it
         let noisy = |seed: u64| {
@@ -223,6 +249,35 @@ mod tests {
         assert!(corrected.value.abs() < 0.003 && given.p_value.unwrap() > 0.02, "{given:?}");
         samples.z = None;
         assert!(both(&samples)[1].value > 0.05);
+    }
+
+    #[test]
+    fn values_stay_where_information_can_be_and_intervals_hold_them_and_have_a_length() {
+        let numbers = |of: fn(u32) -> u32, n: u32| column(&(0..n).map(of).collect::<Vec<_>>());
+        let cases = [
+            // a copy of 30 different values, and of a fair coin; all pairs of 6 and 6 once; a die and its parity
+            samples_of(&numbers(|i| i, 30), &numbers(|i| i, 30)),
+            samples_of(&numbers(|i| i % 2, 30), &numbers(|i| i % 2, 30)),
+            samples_of(&numbers(|i| i / 6, 36), &numbers(|i| i % 6, 36)),
+            samples_of(&numbers(|i| i % 6, 60), &numbers(|i| i % 2, 60)),
+            samples_of(&numbers(|i| i % 5, 40), &numbers(|i| i * i % 7, 40)),
+        ];
+        for samples in cases {
+            let [plug_in, corrected] = both(&samples);
+            let n = samples.len() as f64;
+            assert!(corrected.value <= n.ln() && corrected.value > -1.0 / n.sqrt(), "{corrected:?}");
+            for row in [plug_in, corrected] {
+                if let Some((low, high)) = row.interval_low.zip(row.interval_high) {
+                    assert!(low <= row.value && row.value <= high && high - low > 1.0 / n, "{row:?}");
+                }
+            }
+        }
+        // samples that repeat within episodes: as many as episodes
+        let mut copy = samples_of(&numbers(|i| i / 10 % 2, 200), &numbers(|i| i / 10 % 2, 200));
+        let width = |samples: &Samples| both(samples).map(|r| r.interval_high.unwrap() - r.interval_low.unwrap())[1];
+        let apart = width(&copy);
+        copy.starts = (0..=20).map(|e| 10 * e).collect::<Vec<_>>().into();
+        assert!(width(&copy) > 5.0 * apart, "{} {apart}", width(&copy));
     }
 
     /// n pairs of binary symbols, y equal to x but for a share `flip`; three symbols when `flip` is one half.

@@ -37,6 +37,14 @@ pub(super) struct Fit {
     pub(super) steps: usize,
 }
 
+/// Said of networks that never beat "x tells nothing" on the validation part, whose values are 0 by construction.
+pub(super) fn nothing_learnt(network: &str) -> String {
+    format!(
+        "{network} learned nothing that holds on the validation episodes: its 0 is no evidence of independence; give more \
+         episodes, or compare ksg or gaussian"
+    )
+}
+
 /// Zeroes the last layer of `mlp`, whose parameters are `params`: its output is 0 for every input.
 pub(super) fn silence(mlp: &Mlp, params: &mut [f32]) {
     let (_, last) = mlp.weight(mlp.layers() - 1);

@@ -15,7 +15,9 @@
 //!
 //! # Parameters
 //!
-//! None. The interval is a jackknife over at most 50 groups of whole episodes, the p-value permutes whole episodes.
+//! None. The interval is a jackknife over at most 50 groups of whole episodes, joined with the scatter √(d_x d_y/2)/n of no
+//! dependence: all I that the value lies within t standard errors of, the variance growing with I. The p-value permutes
+//! whole episodes.
 //!
 //! # When it fails
 //!
@@ -33,7 +35,7 @@
 use statrs::function::gamma::digamma;
 
 use super::given::residuals;
-use super::interval::{block_interval, t_quantile};
+use super::interval::{Scatter, block_interval, t_quantile};
 use super::knn::Points;
 use super::linear::{Moments, Symmetric};
 use super::part::Part;
@@ -42,6 +44,7 @@ use super::{Build, Estimate, Estimator, Kind, MiError, Protocol, Unit, p_value};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
 use crate::schema::{Columns, SampleLabels, Samples};
+use crate::stats::mean;
 
 /// The registry's entry.
 pub(super) const ENTRY: Entry<Build> = Entry {
@@ -110,8 +113,14 @@ pub(super) fn estimate(name: &str, samples: &Samples, protocol: Protocol, seeds:
         let local = local_information(samples, &x, &y, &total);
         out.n_effective = block_interval(&local, &blocks).n_effective;
         // without dependence the value is χ² with d_x d_y degrees of freedom over 2n, whose scatter a jackknife misses
-        let remains = libm::sqrt((dx * dy) as f64 / 2.0) / out.n_effective;
-        interval(&mut out, &total, &parts, dx + dy + given, remains, &information);
+        let (degrees, n) = ((dx * dy) as f64, out.n_effective);
+        let error = jackknife(&total, &parts, dx + dy + given, &information);
+        if parts.len() > 1 && error.is_finite() {
+            let scatter =
+                Scatter { seen: value + degrees / (2.0 * n), error, chance: libm::sqrt(degrees / 2.0) / n, n };
+            let (low, high) = scatter.around(value, t_quantile(parts.len()));
+            (out.interval_low, out.interval_high) = (Some(low), Some(high));
+        }
         if parts.len() < 10 {
             warnings.push(format!("few blocks: the interval rests on {} episodes", parts.len()));
         }
@@ -235,32 +244,18 @@ fn local_information(samples: &Samples, x: &Scaled<'_>, y: &Scaled<'_>, total: &
     samples.rows.iter().map(local).collect()
 }
 
-/// Jackknife over the parts, error² = (G − 1)/G Σ (`θ_g` − θ̄)², joined with the error that remains without dependence.
-fn interval(
-    out: &mut Estimate,
-    total: &Moments,
-    parts: &[Moments],
-    width: usize,
-    remains: f64,
-    information: &dyn Fn(&Moments) -> f64,
-) {
+/// Standard error by a jackknife over the parts, error² = (G − 1)/G Σ (`θ_g` − θ̄)².
+fn jackknife(total: &Moments, parts: &[Moments], width: usize, information: &dyn Fn(&Moments) -> f64) -> f64 {
     let g = parts.len() as f64;
-    let left_out: Vec<f64> = parts
-        .iter()
-        .map(|part| {
-            let mut rest = total.clone();
-            rest.add(part, -1.0);
-            if rest.n > (width + 2) as f64 { information(&rest) } else { f64::NAN }
-        })
-        .collect();
-    let mean = left_out.iter().sum::<f64>() / g;
-    let squares: f64 = left_out.iter().map(|v| (v - mean) * (v - mean)).sum();
-    let error = libm::sqrt((g - 1.0) / g * squares);
-    if parts.len() < 2 || !error.is_finite() {
-        return;
-    }
-    let half = libm::hypot(error, remains) * t_quantile(parts.len());
-    (out.interval_low, out.interval_high) = (Some(out.value - half), Some(out.value + half));
+    let left_out = parts.iter().map(|part| {
+        let mut rest = total.clone();
+        rest.add(part, -1.0);
+        if rest.n > (width + 2) as f64 { information(&rest) } else { f64::NAN }
+    });
+    let left_out: Vec<f64> = left_out.collect();
+    let center = mean(&left_out);
+    let squares: f64 = left_out.iter().map(|v| (v - center) * (v - center)).sum();
+    libm::sqrt((g - 1.0) / g * squares)
 }
 
 #[cfg(test)]

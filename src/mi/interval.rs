@@ -43,6 +43,36 @@ pub fn block_interval(values: &[f64], blocks: &[u32]) -> Interval {
     Interval { mean, error, low: mean - half, high: mean + half, n_effective, blocks: count as usize }
 }
 
+/// How an information scatters.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Scatter {
+    /// The information seen, before its bias was subtracted.
+    pub(super) seen: f64,
+    /// Standard error by the spread of the contributions: what dependence brings.
+    pub(super) error: f64,
+    /// Standard error that remains where there is no dependence.
+    pub(super) chance: f64,
+    /// Independent samples.
+    pub(super) n: f64,
+}
+
+impl Scatter {
+    /// Ends of the interval of the information around its bias-corrected `value`, `t` standard errors wide.
+    ///
+    /// All I with |value − I| ≤ t √(c I + chance²). The variance that dependence brings is taken to grow with I: by c = error²/seen, or by
+    /// 2/n where little is seen (the limit of weak dependence, of any kind); the two are joined with the weights seen and chance.
+    /// An interval value ± t·error would be twice too wide without dependence. The value itself is always inside.
+    pub(super) fn around(self, value: f64, t: f64) -> (f64, f64) {
+        let weak = 2.0 / self.n;
+        let weight = self.seen.max(0.0) + self.chance;
+        let slope = if weight > 0.0 { (self.error * self.error + weak * self.chance) / weight } else { weak };
+        let shift = 0.5 * t * t * slope;
+        let square = shift * shift + 2.0 * shift * value + t * t * self.chance * self.chance;
+        let half = libm::sqrt(square.max(0.0));
+        ((value + shift - half).min(value), (value + shift + half).max(value))
+    }
+}
+
 /// The two-sided 95 % quantile of Student's t for `blocks` independent blocks.
 pub(super) fn t_quantile(blocks: usize) -> f64 {
     let degrees = blocks.saturating_sub(1).max(1) as f64;
@@ -61,6 +91,25 @@ mod tests {
         assert!((found.mean - 4.0).abs() < 1e-12 && (found.error - (12.5f64 / 5.0).sqrt()).abs() < 1e-12);
         assert!((found.high - 4.0 - 2.776_445 * found.error).abs() < 1e-5);
         assert!((found.n_effective - 5.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn without_dependence_the_interval_is_that_of_chance_and_with_much_the_usual_one() {
+        // no dependence seen: 0 is inside as long as χ² ≤ 1 + 1.96 √2
+        let at = |chi: f64| {
+            let n = 1000.0;
+            let seen = chi / (2.0 * n);
+            let scatter = Scatter { seen, error: libm::sqrt(2.0 * seen / n), chance: libm::sqrt(0.5) / n, n };
+            scatter.around((chi - 1.0) / (2.0 * n), 1.96)
+        };
+        assert!(at(3.7).0 < 0.0 && at(3.85).0 > 0.0, "{:?} {:?}", at(3.7), at(3.85));
+        // the value is inside, even where it is negative
+        assert!(at(0.0).0 <= -0.5e-3 && at(0.0).1 > 0.0, "{:?}", at(0.0));
+        let much = Scatter { seen: 1.0, error: 0.01, chance: 1e-5, n: 5000.0 };
+        let (low, high) = much.around(1.0, 2.0);
+        assert!((low - 0.98).abs() < 5e-4 && (high - 1.02).abs() < 5e-4, "{low} {high}");
+        let nothing = Scatter { seen: 0.0, error: 0.0, chance: 0.0, n: 10.0 };
+        assert!(nothing.around(0.0, 2.0).1.is_finite());
     }
 
     #[test]

@@ -19,12 +19,13 @@
 //!
 //! None. Critic: two `ReLU` layers of 64 and an embedding of 32 on either side, their dot product; 16 derangements;
 //! Adam 2e-3 falling to 0, weight decay 0.5, at most 600 steps of 256 pairs, stopped on the validation episodes, by
-//! which the scores are then shifted and scaled once.
+//! which the scores are then shifted and scaled once, and held to 3 beyond the range that they have there (upwards: the
+//! range of the pairs).
 //!
 //! # When it fails
 //!
 //! Few samples: held-out values fall to 0, which is honest. A critic that never beats T = 0 on the validation part stays
-//! T = 0: all values are 0, and `jsd-plugin` has no interval. `jsd-nwj` and `jsd-dv` scatter as e^I. The p-value (held-out episodes permuted, critic kept) is
+//! T = 0: all values are 0 and have no interval, and it says so. `jsd-nwj` and `jsd-dv` scatter as e^I. The p-value (held-out episodes permuted, critic kept) is
 //! that of `jsd` and is printed on all five rows.
 //!
 //! # Reference
@@ -40,7 +41,7 @@
 use std::f64::consts::LN_2;
 
 use super::critic::{CriticTape, Separable, dot};
-use super::fit::{Fit, Model, fit, silence};
+use super::fit::{Fit, Model, fit, nothing_learnt, silence};
 use super::prepare::{Prepared, gather, prepare, tied};
 use super::{
     Build, Estimate, Estimator, Interval, Kind, MiError, Protocol, Unit, block_interval, derangements, losses, p_value,
@@ -61,6 +62,8 @@ pub(super) const ENTRY: Entry<Build> = Entry {
 
 /// Product samples per pair.
 const NEGATIVES: usize = 16;
+/// How far held-out scores may lie beyond those of the validation part: more than ordinary samples ever do.
+const BEYOND: f32 = 3.0;
 
 struct Jsd;
 
@@ -132,7 +135,7 @@ impl Estimator for Jsd {
         gather(&data.x, data.x_width, &data.validation, &mut x);
         gather(&data.y, data.y_width, &data.validation, &mut y);
         model.score(&params, &x, &y, data.validation.len(), &mut seeds.stream("validation score"));
-        let scale = if steps == 0 { Scale { slope: 1.0, offset: 0.0 } } else { Scale::fit(&model.tape) };
+        let scale = if steps == 0 { Scale::AS_IS } else { Scale::fit(&model.tape).held_to(&model.tape) };
         let held_out = data.train.len().min(data.test.len());
         gather(&data.x, data.x_width, &data.train[..held_out], &mut x);
         gather(&data.y, data.y_width, &data.train[..held_out], &mut y);
@@ -157,9 +160,9 @@ impl Estimator for Jsd {
         if held.jsd.mean > 0.9 * 2.0 * LN_2 {
             warnings.push("near the ceiling of 2 ln 2: the values in nats are too low".to_owned());
         }
+        warnings.extend((steps == 0).then(|| nothing_learnt("the critic")));
         for row in &mut rows {
-            if steps == 0 && row.kind == Kind::Estimate {
-                // T = 0 says nothing about the truth
+            if steps == 0 {
                 (row.interval_low, row.interval_high) = (None, None);
             }
             row.p_value = p;
@@ -170,16 +173,29 @@ impl Estimator for Jsd {
 }
 
 /// A correction of the critic's scores, T ← slope T + offset: logistic regression on the validation part. Without it
-/// `E_p`\[T\] inherits the level at which training happened to stop.
-#[derive(Clone, Copy, Debug)]
+/// `E_p`\[T\] inherits the level at which training happened to stop. Scores far outside those of the validation part are
+/// held to them: far from all data the critic extrapolates, and one e^T there was worth −3e10.
+#[derive(Clone, Copy, Debug, PartialEq)]
 struct Scale {
     slope: f32,
     offset: f32,
+    least: f32,
+    most: f32,
 }
 
 impl Scale {
+    const AS_IS: Self = Self { slope: 1.0, offset: 0.0, least: f32::NEG_INFINITY, most: f32::INFINITY };
+
     fn of(self, t: f32) -> f32 {
-        self.slope * t + self.offset
+        (self.slope * t + self.offset).max(self.least).min(self.most)
+    }
+
+    /// The same, held to [`BEYOND`] under the least score of the tape and above the greatest of a pair.
+    fn held_to(self, tape: &CriticTape) -> Self {
+        let free = Self { least: f32::NEG_INFINITY, most: f32::INFINITY, ..self };
+        let pairs = || tape.positive.iter().map(|&t| free.of(t));
+        let least = pairs().chain(tape.negative.iter().map(|&t| free.of(t))).fold(f32::INFINITY, f32::min);
+        Self { least: least - BEYOND, most: pairs().fold(f32::NEG_INFINITY, f32::max) + BEYOND, ..self }
     }
 
     /// Maximises `jsd` on the scores in the tape by Newton's method, held to (1, 0) by the weight of one pair.
@@ -207,9 +223,9 @@ impl Scale {
             }
         }
         if slope.is_finite() && offset.is_finite() {
-            Self { slope: slope as f32, offset: offset as f32 }
+            Self { slope: slope as f32, offset: offset as f32, ..Self::AS_IS }
         } else {
-            Self { slope: 1.0, offset: 0.0 }
+            Self::AS_IS
         }
     }
 }
@@ -320,6 +336,44 @@ pub fn certified(jsd: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mi::run::tests::{linear_samples, samples_of};
+    use crate::rng;
+
+    fn rows(samples: &Samples) -> Vec<Estimate> {
+        Jsd.estimate(samples, &Protocol { permutations: 19 }, &Seeds::new(1)).unwrap()
+    }
+
+    #[test]
+    fn scores_are_held_only_far_outside_what_validation_showed() {
+        let mut tape = CriticTape::default();
+        (tape.positive, tape.negative) = (vec![0.0, 2.0], vec![-1.0, 5.0]);
+        let scale = Scale { slope: 2.0, offset: 1.0, ..Scale::AS_IS }.held_to(&tape);
+        assert_eq!(scale, Scale { slope: 2.0, offset: 1.0, least: -4.0, most: 8.0 });
+        assert_eq!([-9.0, -2.0, 3.0, 30.0].map(|t| scale.of(t)), [-4.0, -3.0, 7.0, 8.0]);
+    }
+
+    #[test]
+    fn tails_without_variance_leave_all_five_values_sane() {
+        for seed in 0..5 {
+            let mut rng = Seeds::new(seed).stream("cauchy");
+            let mut cauchy = || vec![rng::normal(&mut rng) / rng::normal(&mut rng)];
+            let (x, y): (Vec<_>, Vec<_>) = (0..1000).map(|_| (cauchy(), cauchy())).unzip();
+            for row in rows(&samples_of(&x, &y)) {
+                assert!((-100.0..1.0).contains(&row.value), "{}: {}", row.estimator, row.value);
+            }
+        }
+    }
+
+    #[test]
+    fn a_critic_that_learned_nothing_gives_no_interval_and_says_so() {
+        let wide = (0..20).map(|seed| rows(&linear_samples(0.0, 100, 10, seed)));
+        for row in wide.into_iter().find(|rows| rows[0].value.abs() < 1e-6).unwrap() {
+            assert_eq!((row.interval_low, row.interval_high), (None, None), "{}", row.estimator);
+            assert!(row.value.abs() < 1e-6, "{row:?}");
+            assert!(row.warnings[0].starts_with("the critic learned nothing that holds on the validation"), "{row:?}");
+        }
+        assert!(rows(&linear_samples(0.8, 1000, 1, 1)).iter().all(|r| r.interval_low.is_some()));
+    }
 
     #[test]
     fn the_certified_bound_equals_its_published_values() {

@@ -16,7 +16,8 @@
 //!
 //! # When it fails
 //!
-//! An upper bound only when q is good, as `club`, but far tighter: with the exact q it tends to the information itself.
+//! An upper bound only when q is good, as `club`, but far tighter: with the exact q it tends to the information itself. A q that
+//! never beats the margin on the validation part stays the margin: the value is 0 and has no interval, and it says so.
 //!
 //! # Reference
 //!

@@ -22,6 +22,8 @@
 //! # When it fails
 //!
 //! As `nwj`; besides, ln of a mean over few pairs is too low, so that the value itself leans upwards.
+//! A critic that
+//! never beats T = 0 on the validation part stays T = 0: the value is 0 and has no interval, and it says so.
 //!
 //! # Reference
 //!

@@ -6,22 +6,26 @@
 //! Adding an estimator: write `mi/<name>.rs` with an `ENTRY`, and add `mod <name>;` and `<name>::ENTRY,` below. The
 //! rest of the room is protocol: `prepare` (standardised, split by episode), `fit` (training, stopped on validation),
 //! `interval` (episodes as blocks), `null` (whole episodes permuted), `part` (parts of the samples by whole episodes),
-//! `run` (all jobs in parallel); and what several share: `critic`,
-//! `scorer`, `bounds` and `contrast` (trained critics), `linear` (covariances), `student` (t copulas), `given` (z), `knn` and `neighbours`, `counts`.
+//! `run` (all jobs in parallel), `form` (rows as files); and what several share: `critic`, `scorer`, `bounds`, `contrast`
+//! and `contrast_given` (trained critics), `linear` (covariances), `student` (t copulas), `given` (z), `knn` and
+//! `neighbours`, `counts`.
 
 pub(crate) mod all_pairs;
 mod auto;
 mod bounds;
 mod calibrate;
+mod checks;
 mod club;
 mod club_sample;
 pub mod conditional;
 mod contrast;
+mod contrast_given;
 mod counts;
 pub mod critic;
 mod discrete;
 mod estimate;
 mod fit;
+mod form;
 mod gaussian;
 mod gcmi;
 mod given;
@@ -50,14 +54,16 @@ mod student;
 mod t_copula;
 mod tasks;
 
-pub use calibrate::{Calibrated, calibrate};
-pub use estimate::{Estimate, Kind, Unit, is_estimates, to_csv, to_json, to_parquet};
+pub use calibrate::{Calibrated, Drawn, Source, calibrate, calibrated};
+pub use checks::{Check, NORMALS, SERIES};
+pub use estimate::{Estimate, Kind, Unit};
+pub use form::{Row, holds, to_csv, to_json, to_parquet};
 pub use interval::{Interval, block_interval};
 pub use jsd::certified;
 pub use negatives::{all_others, derangements};
 pub use neighbours::ksg1_value;
 pub use null::{p_value, permuted_rows};
-pub use run::{Job, JobResult, Named, Plan, run};
+pub use run::{Job, JobResult, Named, Plan, in_order, run, run_each};
 pub use tasks::{TASKS, Task};
 
 use crate::registry::{Entry, RegistryError, Spec};

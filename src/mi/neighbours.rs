@@ -95,9 +95,10 @@ impl Neighbours {
         let statistic = |from: &[u32], rows: &[u32]| mean(&terms(from, rows));
         let limits = Limits::of(width);
         let part = Part::drawn(samples, limits.interval, &seeds.child("interval"));
-        let error = part.subsampled_error(n, 4 * (self.k + 1), seeds, &|rows| statistic(rows, rows));
-        if let Some((error, degrees)) = error {
-            let half = error * t_quantile(degrees + 1);
+        let subsampled = part.subsampled_error(n, 4 * (self.k + 1), seeds, &|rows| statistic(rows, rows));
+        if let Some(of) = subsampled {
+            // what more samples would still change is an error too: in more than two columns it is no small one
+            let half = libm::hypot(of.error * t_quantile(of.degrees + 1), of.drift(value, n));
             (out.interval_low, out.interval_high) = (Some(value - half), Some(value + half));
         }
         let part = Part::drawn(samples, limits.null, &seeds.child("null"));

@@ -20,7 +20,8 @@
 //!
 //! # When it fails
 //!
-//! Strong dependence: e^T of a few pairs decides, which is warned of. Few samples: the held-out value falls to 0.
+//! Strong dependence: e^T of a few pairs decides, which is warned of. Few samples: the held-out value falls to 0. A critic that
+//! never beats T = 0 on the validation part stays T = 0: the value is 0 and has no interval, and it says so.
 //!
 //! # Reference
 //!

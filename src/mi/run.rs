@@ -1,5 +1,7 @@
 //! All jobs of a command in parallel: every set of samples with every estimator, in a fixed order.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use rayon::prelude::*;
 
 use super::{Estimate, Estimator, Kind, MiError, Protocol, Unit};
@@ -41,21 +43,44 @@ pub struct JobResult {
 ///
 /// The result does not depend on the number of threads: a job's randomness comes from its name.
 pub fn run(samples: &[Samples], plan: &Plan, done: &(dyn Fn() + Sync)) -> Vec<JobResult> {
+    let results = std::sync::Mutex::new(Vec::new());
+    run_each(samples, plan, &AtomicBool::new(false), &|place, result| {
+        results.lock().unwrap_or_else(std::sync::PoisonError::into_inner).push((place, result));
+        done();
+    });
+    in_order(results.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner), plan)
+}
+
+/// As [`run()`], but hands out each result, with its place among all, as soon as it is there; once `stop` is raised, no
+/// job is started.
+pub fn run_each(samples: &[Samples], plan: &Plan, stop: &AtomicBool, tell: &(dyn Fn(usize, JobResult) + Sync)) {
     let seeds = Seeds::new(plan.seed).child("estimate-mi");
     let jobs: Vec<(&Samples, &Named)> =
         samples.iter().flat_map(|s| plan.estimators.iter().map(move |e| (s, e))).collect();
-    let work = |&(samples, (name, estimator)): &(&Samples, &Named)| {
+    jobs.par_iter().enumerate().for_each(|(place, &(samples, (name, estimator)))| {
+        if stop.load(Ordering::SeqCst) {
+            return;
+        }
         let labels = samples.labels.clone();
-        let seeds = seeds.child(&format!("{}/{}/{:?}", labels.x, labels.y, labels.delivered)).child(name);
+        let seeds = job_seeds(&seeds, &labels, name);
         let rows = fits(samples, &**estimator).and_then(|()| estimator.estimate(samples, &plan.protocol, &seeds));
-        done();
-        JobResult { job: Job { estimator: name.clone(), labels }, rows }
-    };
-    let mut results: Vec<JobResult> = jobs.par_iter().map(work).collect();
-    for same_samples in results.chunks_mut(plan.estimators.len().max(1)) {
+        tell(place, JobResult { job: Job { estimator: name.clone(), labels }, rows });
+    });
+}
+
+/// Results by their places among all jobs, rows of the same samples compared with each other; some may be missing.
+pub fn in_order(mut results: Vec<(usize, JobResult)>, plan: &Plan) -> Vec<JobResult> {
+    let per_samples = plan.estimators.len().max(1);
+    results.sort_by_key(|(place, _)| *place);
+    for same_samples in results.chunk_by_mut(|a, b| a.0 / per_samples == b.0 / per_samples) {
         compare(same_samples);
     }
-    results
+    results.into_iter().map(|(_, result)| result).collect()
+}
+
+/// What a job draws from, below the node of the command.
+fn job_seeds(command: &Seeds, labels: &SampleLabels, estimator: &str) -> Seeds {
+    command.child(&format!("{}/{}/{:?}", labels.x, labels.y, labels.delivered)).child(estimator)
 }
 
 /// Whether the estimator can take the samples at all.
@@ -73,14 +98,15 @@ fn fits(samples: &Samples, estimator: &dyn Estimator) -> Result<(), MiError> {
 }
 
 /// An upper bound below a lower bound of the same samples is none.
-fn compare(results: &mut [JobResult]) {
-    let rows = || results.iter().flat_map(|r| r.rows.iter().flatten());
+fn compare(results: &mut [(usize, JobResult)]) {
+    let rows = || results.iter().flat_map(|r| r.1.rows.iter().flatten());
     let lower = rows()
         .filter(|r| r.kind == Kind::LowerBound && r.unit == Unit::Nats)
         .filter_map(|r| Some((r.interval_low?, r.estimator.clone())))
+        .filter(|(low, _)| *low > 0.0)
         .max_by(|a, b| a.0.total_cmp(&b.0));
     let Some((low, name)) = lower else { return };
-    for row in results.iter_mut().flat_map(|r| r.rows.iter_mut().flatten()) {
+    for row in results.iter_mut().flat_map(|r| r.1.rows.iter_mut().flatten()) {
         if row.kind == Kind::UpperBound && row.value + 1e-3 < low {
             row.warnings.push(format!("below the lower bound {name} ({low:.3}): q fits badly, this is no upper bound"));
         }
@@ -163,12 +189,33 @@ pub(super) mod tests {
             rows: Ok(vec![row]),
         };
         let upper = Estimate::new("club", &labels, 0.1, Unit::Nats, Kind::UpperBound, 9);
+        let other = upper.clone();
         let mut lower = Estimate::new("jsd-nwj", &labels, 0.5, Unit::Nats, Kind::LowerBound, 9);
         lower.interval_low = Some(0.4);
-        let mut results = [job(upper), job(lower)];
-        compare(&mut results);
-        let warnings = &results[0].rows.as_ref().unwrap()[0].warnings;
+        let plan = plan(&["club", "jsd"], 0, 1);
+        let results = in_order(vec![(3, job(lower)), (0, job(other)), (2, job(upper))], &plan);
+        assert_eq!(results[0].rows.as_ref().unwrap()[0].warnings, [""; 0], "other samples");
+        let warnings = &results[1].rows.as_ref().unwrap()[0].warnings;
         assert_eq!(*warnings, ["below the lower bound jsd-nwj (0.400): q fits badly, this is no upper bound"]);
+    }
+
+    #[test]
+    fn a_raised_flag_starts_nothing_new() {
+        let sets: Vec<Samples> = (0..20).map(|i| linear_samples(0.6, 100, 1, i)).collect();
+        let (plan, stop) = (plan(&["gaussian"], 0, 1), AtomicBool::new(false));
+        let told = std::sync::Mutex::new(Vec::new());
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+        pool.install(|| {
+            run_each(&sets, &plan, &stop, &|place, result| {
+                told.lock().unwrap().push((place, result));
+                stop.store(told.lock().unwrap().len() == 3, Ordering::SeqCst);
+            });
+        });
+        let told = in_order(told.into_inner().unwrap(), &plan);
+        assert_eq!(told.len(), 3);
+        let whole = run(&sets, &plan, &|| ());
+        let value = |r: &JobResult| r.rows.as_ref().unwrap()[0].value;
+        assert!(told.iter().all(|r| whole.iter().any(|w| value(w) == value(r))));
     }
 
     #[test]

@@ -62,7 +62,7 @@ fn errors_name_the_remedy_and_have_the_right_exit_code() {
         (
             2,
             &[&table, "--x", "a", "--y", "b", "--given", "g", "--estimator", "jsd"],
-            "it estimates nothing given z: leave out --given, or take one of auto, discrete, gaussian, gcmi, ksg, ksg1, ksg-mixed",
+            "it estimates nothing given z: leave out --given, or take one of auto, discrete, gaussian, gcmi, infonce, ksg, ksg1, ksg-mixed",
         ),
         (
             1,

@@ -17,6 +17,7 @@ mod link_commands;
 mod links;
 mod mi;
 mod probe;
+mod probe_stores;
 mod record;
 mod recovery;
 mod refusals;

@@ -1,0 +1,121 @@
+//! Rows of estimates: how they are printed, which file they go to, and what is said about jobs that gave none.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use super::outputs::{self, Write};
+use super::ui;
+use crate::mi::{self, Estimate, Job, JobResult, Kind};
+use crate::schema::{SampleLabels, Samples};
+use crate::{Error, io};
+
+/// A job that gave no rows, and why.
+pub(super) type Failure = (Job, mi::MiError);
+
+/// How the rows are written to a file of this name, which must not hold anything that is not ours.
+pub(super) fn writer(path: &Path, input: &Path, force: bool) -> anyhow::Result<Write<Estimate>> {
+    let real = |p: &Path| p.canonicalize().ok();
+    if real(path).is_some() && real(path) == real(input) {
+        let message = format!("--out would replace the input: {}", path.display());
+        return Err(Error::Usage(message).into());
+    }
+    Ok(outputs::table(path, force)?)
+}
+
+/// All rows, and the jobs that gave none; an error when no job gave any.
+pub(super) fn split(results: Vec<JobResult>) -> Result<(Vec<Estimate>, Vec<Failure>), Error> {
+    let (mut rows, mut failures) = (Vec::new(), Vec::new());
+    for JobResult { job, rows: result } in results {
+        match result {
+            Ok(found) => rows.extend(found),
+            Err(error) => failures.push((job, error)),
+        }
+    }
+    match failures.pop() {
+        Some((_, error)) if rows.is_empty() => Err(error.into()),
+        last => {
+            failures.extend(last);
+            Ok((rows, failures))
+        }
+    }
+}
+
+/// The word for a class of messages.
+pub(super) fn class(delivered: bool) -> &'static str {
+    if delivered { "delivered" } else { "lost" }
+}
+
+/// `agent_0 → agent_1 delivered`, or `a,b → c`.
+pub(super) fn place(labels: &SampleLabels) -> String {
+    match (&labels.sender, &labels.receiver, labels.delivered) {
+        (Some(sender), Some(receiver), Some(delivered)) => {
+            let lag = labels.y.rsplit_once("[+").map_or(String::new(), |(_, lag)| format!(" [+{lag}"));
+            format!("{sender} → {receiver} {}{lag}", class(delivered))
+        }
+        _ => match &labels.given {
+            Some(given) => format!("{} ; {} | {given}", labels.x, labels.y),
+            None => format!("{} ; {}", labels.x, labels.y),
+        },
+    }
+}
+
+/// Four decimals, and no minus sign before a zero.
+pub(super) fn decimals(value: f64) -> String {
+    let text = format!("{value:.4}");
+    if text == "-0.0000" { "0.0000".to_owned() } else { text }
+}
+
+/// The rows as a table for people, with their warnings below.
+pub(super) fn print(rows: &[Estimate], samples: &[Samples]) -> anyhow::Result<()> {
+    let mut warnings: BTreeMap<&str, Vec<String>> = BTreeMap::new();
+    let mut lines = Vec::new();
+    let mut places = rows.iter().map(|row| {
+        samples.iter().map(|s| &s.labels).find(|l| {
+            (&l.x, &l.y, &l.sender, &l.receiver) == (&row.x, &row.y, &row.sender, &row.receiver)
+                && l.delivered == row.delivered
+        })
+    });
+    let mut before = String::new();
+    for row in rows {
+        let here = places.next().flatten().map(place).unwrap_or_default();
+        let sign = match row.kind {
+            Kind::LowerBound => "≥ ",
+            Kind::UpperBound => "≤ ",
+            Kind::Estimate => "",
+        };
+        let value = if row.value.is_infinite() {
+            "infinite (copy)".to_owned()
+        } else {
+            format!("{sign}{}", decimals(row.value))
+        };
+        let interval = row.interval_low.zip(row.interval_high);
+        lines.push(vec![
+            if here == before { String::new() } else { here.clone() },
+            row.estimator.clone(),
+            value,
+            interval.map_or_else(String::new, |(low, high)| format!("{} … {}", decimals(low), decimals(high))),
+            row.unit.name().to_owned(),
+            row.p_value.map_or_else(String::new, |p| format!("{p:.3}")),
+            row.n.to_string(),
+            format!("{:.0}", row.n_effective),
+        ]);
+        for warning in &row.warnings {
+            let named = warnings.entry(warning).or_default();
+            if !named.contains(&here) {
+                named.push(here.clone());
+            }
+        }
+        before = here;
+    }
+    ui::print_table(&["samples", "estimator", "value", "95 % interval", "unit", "p", "n", "n_eff"], &lines)?;
+    if samples.iter().any(|s| s.labels.group == "row") {
+        ui::print("each row was taken as independent; give --group or --time if rows belong together")?;
+    }
+    for (warning, places) in warnings {
+        let shown = places.iter().take(3).map(String::as_str).collect::<Vec<_>>().join(", ");
+        let more = if places.len() > 3 { format!(" and {} more", places.len() - 3) } else { String::new() };
+        let kind = if warning.starts_with(mi::NOTE) { "" } else { "warning: " };
+        ui::print(&format!("{kind}{} ({}{more})", io::printable(warning), io::printable(&shown)))?;
+    }
+    Ok(())
+}
