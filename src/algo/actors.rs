@@ -1,7 +1,7 @@
 //! The actors of a team: one network per learner, over its own observation and the messages it received.
 //!
 //! Input of actor i: `[o_i, ι^{1i} m^{1i}, …]` over the other learners in order; a lost message is zeros. The message
-//! is the sender's observation (Message-Dropout's convention), or m^j = f_j(o^j) of the sender's encoder, whose tanh
+//! is the sender's observation (Message-Dropout's convention), or `m^j = f_j(o^j)` of the sender's encoder, whose tanh
 //! keeps it in [−1, 1].
 
 use std::ops::Range;

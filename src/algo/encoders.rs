@@ -1,4 +1,4 @@
-//! The encoders of a team on many rows at once: m^j = f_j(o^j), one network per learner.
+//! The encoders of a team on many rows at once: `m^j = f_j(o^j)`, one network per learner.
 //!
 //! They learn through the actors that receive them: ∂L/∂m^j of a row is the sum, over the receivers i whose bit ι^{ji}
 //! of that row is set, of what actor i's backward pass gives at the inputs that m^j went into. A lost message gives

@@ -1,7 +1,7 @@
 //! MADDPG with one centralised critic and messages over unreliable links.
 //!
 //! Definition: critic Q(o^1…o^N, a^1…a^N), one for the team; actor i is π^i(o^i, {ι^{ji} m^{ji}}_{j≠i}) with m = the
-//! sender's observation, or m^j = f_j(o^j) of its encoder. Per update, on one minibatch of B transitions:
+//! sender's observation, or `m^j = f_j(o^j)` of its encoder. Per update, on one minibatch of B transitions:
 //!
 //! 1. y = r̃ + γ Q⁻(o', π⁻(o', M')), no mask at the time limit; r̃ = r + bonus (the Du-MIE's, if any);
 //! 2. critic: one Adam step on mean (Q(o, a) − y)², gradient clipped at L2 norm 0.5;
@@ -9,7 +9,7 @@
 //! 4. targets: θ⁻ ← (1 − τ) θ⁻ + τ θ.
 //!
 //! Encoders are part of 3 and 4: M is computed anew from o (with the target encoders in 1), the loss of every actor that
-//! received m^j flows into f_j, and what was lost gives no gradient. Each encoder's gradient is clipped by itself, so
+//! received m^j flows into `f_j`, and what was lost gives no gradient. Each encoder's gradient is clipped by itself, so
 //! that it does not shrink an actor's step; learning rate and τ are the actors'. The critic sees observations and
 //! actions alone: messages are functions of those.
 //!
@@ -354,7 +354,7 @@ mod tests {
         let mut draw = |n: usize| (0..n).map(|_| rng::uniform(&mut rng, -1.0, 1.0) as f32).collect::<Vec<_>>();
         let mut rng2 = Seeds::new(9).stream("bits");
         let links = n * n;
-        let mut bit = |i: usize| i % links % (n + 1) == 0 || rng::bernoulli(&mut rng2, 0.5);
+        let mut bit = |i: usize| (i % links).is_multiple_of(n + 1) || rng::bernoulli(&mut rng2, 0.5);
         let mut bits = || (0..rows * links).map(&mut bit).collect::<Vec<_>>();
         let observed: usize = agents(n).iter().map(|a| a.observation).sum();
         Batch {
@@ -542,7 +542,7 @@ mod tests {
                 (Messages::Encoder, Some(vec![20, 7])),
             ] {
                 let (grad_clip, action_penalty) = (f32::INFINITY, 0.1);
-                let base = MaddpgConfig { grad_clip, action_penalty, actor_step, messages, ..MaddpgConfig::default() };
+                let base = MaddpgConfig { grad_clip, action_penalty, messages, actor_step, ..MaddpgConfig::default() };
                 let config = MaddpgConfig { encoder_hidden, ..base };
                 let mut learner = Maddpg::new(&agents, Activation::Tanh, config, &Seeds::new(4)).unwrap();
                 learner.td_pass(&batch, &[], false); // lays out the critic
@@ -576,7 +576,7 @@ mod tests {
         let config = MaddpgConfig { messages: Messages::Encoder, ..MaddpgConfig::default() };
         let mut learner = Maddpg::new(&agents, Activation::Tanh, config, &Seeds::new(4)).unwrap();
         let mut batch = batch(150, 3);
-        let silent = |at: usize| at % 9 % 4 == 0;
+        let silent = |at: usize| (at % 9).is_multiple_of(4);
         batch.link = (0..9 * 150).map(|at| silent(at) || at % 9 == 5).collect(); // of all messages, 1 → 2 alone arrives
         learner.td_pass(&batch, &[], false);
         let (_, [actors, encoders]) = learner.actor_pass(&batch);

@@ -93,5 +93,5 @@ pub(super) fn print_channels(channels: &[ChannelSummary]) -> anyhow::Result<()> 
         ]
     };
     let rows: Vec<Vec<String>> = channels.iter().map(line).collect();
-    Ok(ui::print_table(&["channel", "return", "± over episodes", "messages lost", "episodes"], &rows)?)
+    ui::print_table(&["channel", "return", "± over episodes", "messages lost", "episodes"], &rows)
 }

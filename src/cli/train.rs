@@ -219,10 +219,10 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         }
         return Ok(Outcome::Interrupted);
     }
-    if protocol != Protocol::None {
-        ui::say(&format!("next: ccmarl report {out} --out reports/first"));
-    } else {
+    if protocol == Protocol::None {
         ui::say(&format!("next: ccmarl evaluate {out} --suite paper"));
+    } else {
+        ui::say(&format!("next: ccmarl report {out} --out reports/first"));
     }
     Ok(Outcome::Done)
 }

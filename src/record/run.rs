@@ -2,7 +2,7 @@
 //! A trained team: the actors of a run directory, with or without exploration noise.
 //!
 //! # Definition
-//! a^i = clamp(π^i(o^i, {ι^{ji} m^j}) + noise, low, 1), low −1, or 0 for decoder `mpe2`; m^j is o^j, or f_j(o^j) of a team
+//! a^i = clamp(π^i(o^i, {ι^{ji} m^j}) + noise, low, 1), low −1, or 0 for decoder `mpe2`; m^j is o^j, or `f_j(o^j)` of a team
 //! trained with `maddpg.messages = "encoder"`. Noise is none, Gaussian with standard deviation σ, or the
 //! Ornstein–Uhlenbeck process x ← x − θ x + σ z of the training loop, times its scale.
 //!
@@ -280,7 +280,9 @@ impl PolicyEpisode for Acting<'_> {
 fn gather(columns: &[[usize; 2]], from: &[f32], width: usize, rows: &mut Vec<f32>) {
     rows.clear();
     for row in from.chunks_exact(width.max(1)) {
-        columns.iter().for_each(|&[from, to]| rows.extend_from_slice(&row[from..to]));
+        for &[from, to] in columns {
+            rows.extend_from_slice(&row[from..to]);
+        }
     }
 }
 

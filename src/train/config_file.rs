@@ -52,13 +52,10 @@ impl TrainConfig {
         // what is given stands before the text where that does not have it, so that places in the text are known; a text
         // that is no TOML is left to tell its fault
         let has = |key: &str| text.parse::<toml::Table>().map_or(true, |table| table.contains_key(key));
-        let mut before = String::new();
-        if let Some(algorithm) = given.algorithm.filter(|_| !has("algorithm")) {
-            before.push_str(&format!("algorithm = {}\n", toml::Value::from(algorithm)));
-        }
-        if let Some(name) = given.scenario.map(|spec| spec.name.as_str()).filter(|_| !has("scenario")) {
-            before.push_str(&format!("scenario = {}\n", toml::Value::from(name)));
-        }
+        let given = [("algorithm", given.algorithm), ("scenario", given.scenario.map(|spec| spec.name.as_str()))];
+        let missing = given.into_iter().filter(|(key, _)| !has(key));
+        let line = |(key, value): (&str, Option<&str>)| Some(format!("{key} = {}\n", toml::Value::from(value?)));
+        let before: String = missing.filter_map(line).collect();
         toml::from_str(&format!("{before}{text}")).map_err(|error| {
             let place = error.span().and_then(|span| place(text, span.start.checked_sub(before.len())?));
             let (at, excerpt) = match place {
