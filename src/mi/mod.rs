@@ -7,7 +7,7 @@
 //! rest of the room is protocol: `prepare` (standardised, split by episode), `fit` (training, stopped on validation),
 //! `interval` (episodes as blocks), `null` (whole episodes permuted), `part` (parts of the samples by whole episodes),
 //! `run` (all jobs in parallel), `form` (rows as files); and what several share: `critic`,
-//! `scorer`, `bounds`, `contrast` and `contrast_given` (trained critics), `linear` (covariances), `given` (z), `knn` and `neighbours`, `counts`.
+//! `scorer`, `bounds`, `contrast` and `contrast_given` (trained critics), `linear` (covariances), `given` (z), `knn` and `neighbours`, `counts` and `unseen`.
 
 pub(crate) mod all_pairs;
 mod auto;
@@ -50,6 +50,7 @@ mod scorer;
 pub(crate) mod shifted;
 mod smile;
 mod tasks;
+mod unseen;
 
 pub use calibrate::{Calibrated, Drawn, Source, calibrate, calibrated};
 pub use checks::{Check, NORMALS, SERIES};
