@@ -8,7 +8,7 @@
 //! `interval` (episodes as blocks), `null` (whole episodes permuted), `part` (parts of the samples by whole episodes),
 //! `run` (all jobs in parallel), `form` (rows as files); and what several share: `critic`, `scorer`, `bounds`, `contrast`
 //! and `contrast_given` (trained critics), `linear` (covariances), `student` (t copulas), `given` (z), `knn` and
-//! `neighbours`, `counts`.
+//! `neighbours`, `counts`, `unseen`.
 
 pub(crate) mod all_pairs;
 mod auto;
@@ -53,6 +53,7 @@ mod smile;
 mod student;
 mod t_copula;
 mod tasks;
+mod unseen;
 
 pub use calibrate::{Calibrated, Drawn, Source, calibrate, calibrated};
 pub use checks::{Check, NORMALS, SERIES};

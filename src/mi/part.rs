@@ -8,8 +8,7 @@ use super::{Protocol, permuted_rows};
 use crate::rng::{self, Seeds};
 use crate::schema::{Exchange, Samples};
 
-/// Groups into which one round of subsampling deals the episodes. Few: the variance times the size of a group grows with the
-/// size (nearest neighbours without dependence: 0.34 at 50, 0.43 at 100, 0.51 at 500), so small groups promise too much.
+/// Groups into which one round of subsampling deals the episodes: few, since small groups tell less of all samples.
 const GROUPS: usize = 4;
 /// Rounds of subsampling.
 const ROUNDS: usize = 10;
@@ -19,7 +18,7 @@ const LEAST: usize = 20;
 /// What subsampling says about a statistic.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Subsampled {
-    /// Its standard error on all samples.
+    /// Its standard error on all samples, should its variance fall as their number.
     pub(super) error: f64,
     /// Degrees of freedom of that.
     pub(super) degrees: usize,
@@ -30,6 +29,11 @@ pub(super) struct Subsampled {
 }
 
 impl Subsampled {
+    /// The error on `n` samples of a statistic whose variance times the number m of samples grows as m/(m + `growth`).
+    pub(super) fn error_on(self, n: usize, growth: f64) -> f64 {
+        self.error * libm::sqrt((1.0 + growth / self.size) / (1.0 + growth / n as f64))
+    }
+
     /// How far a statistic with this value on `n` samples may still be from where it goes as samples are added, if what
     /// is left falls as 1/√n.
     pub(super) fn drift(self, value: f64, n: usize) -> f64 {
@@ -187,6 +191,8 @@ mod tests {
         assert!(found.drift(mean(&samples.rows), 2000).abs() < 1e-12);
         let falling = |rows: &[u32]| 1.0 - 1.0 / (rows.len() as f64).sqrt();
         let found = Part::all(&samples).subsampled_error(2000, 5, &Seeds::new(1), &falling).unwrap();
+        // the variance of 500, and of 2000 if it grows as m/(m + 500)
+        assert!((found.error_on(2000, 500.0) - found.error * 1.6f64.sqrt()).abs() < 1e-12);
         assert!((found.drift(falling(&samples.rows), 2000) - 1.0 / 2000f64.sqrt()).abs() < 1e-12);
         assert!((error / expected - 1.0).abs() < 0.25, "{error} against {expected}");
         assert_eq!(degrees, 30);

@@ -3,8 +3,8 @@
 
 use std::fmt::Write as _;
 use std::path::Path;
+use std::process::Command;
 
-use assert_cmd::Command;
 use ccmarl::link::LINKS;
 use ccmarl::mi::ESTIMATORS;
 use serde_json::Value;
@@ -17,7 +17,7 @@ fn rows(link: &str, rho: f64, episodes: usize, estimators: &str) -> Vec<Value> {
     let store = dir.path().join("probe");
     let (store, episodes, policy) = (store.to_str().unwrap(), episodes.to_string(), format!("probe:{rho}"));
     let run = |args: &[&str]| {
-        let output = Command::cargo_bin("ccmarl").unwrap().args(args).output().unwrap();
+        let output = Command::new(env!("CARGO_BIN_EXE_ccmarl")).args(args).output().unwrap();
         assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
         output.stdout
     };
@@ -64,6 +64,12 @@ fn messages_that_arrive_tell_what_the_probe_says_and_lost_ones_nothing() {
 #[ignore = "minutes: every link, four strengths, every estimator; writes reports/calibration/probe.csv"]
 fn every_link_and_estimator_in_figures() {
     let dir = files();
+    let mut bits = "episode,step,sender,receiver,delivered\n".to_owned();
+    for (episode, step, sender) in (0..160).flat_map(|e| (0..26).flat_map(move |t| [(e, t, 0), (e, t, 1)])) {
+        let bit = u8::from((7 * episode + 3 * step + 5 * sender) % 4 > 0);
+        writeln!(bits, "{episode},{step},agent_{sender},agent_{},{bit}", 1 - sender).unwrap();
+    }
+    ccmarl::io::write_atomic(&dir.path().join("trace.csv"), bits.as_bytes()).unwrap();
     let names: Vec<&str> = ESTIMATORS.iter().map(|e| e.name).filter(|&name| name != "ksg").collect();
     let keys =
         ["sender", "receiver", "delivered", "estimator", "kind", "unit", "n", "value", "interval_low", "interval_high"];
