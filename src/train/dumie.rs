@@ -225,15 +225,15 @@ impl Dumie {
             let of = if self.jsd.len() == 1 { rng::below(rng, n * (n - 1)) } else { index };
             let (j, i) = (of / (n - 1), of % (n - 1));
             let i = i + usize::from(i >= j);
-            let [mut observation, action, bits] = replay.places(transition);
+            let [observed, action, bits] = replay.places(transition);
             let delivered = replay.link[bits + j * n + i];
             if delivered == (class == Class::Delivered) {
-                if let Some(seen) = &mut seen {
+                let row = seen.as_mut().map_or(observed, |seen| {
                     seen.extend_from_slice(replay.observed(transition));
-                    observation = pairs.len() * sent;
-                }
+                    pairs.len() * sent
+                });
                 let [message, to] = self.pair(delivered, j, i);
-                pairs.push([observation + message[0], message[1]], [action + to[0], to[1]], 0);
+                pairs.push([row + message[0], message[1]], [action + to[0], to[1]], 0);
                 if pairs.len() == self.config.batch {
                     return true;
                 }
@@ -326,6 +326,8 @@ fn link(n: usize, j: usize, i: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::algo::{MaddpgConfig, Messages};
+    use crate::nn::{Activation, Tape};
     use crate::schema::{AgentSpec, Controller, Matrix};
     use crate::train::config::Negatives;
 
@@ -445,6 +447,32 @@ mod tests {
     }
 
     #[test]
+    fn pairs_from_replay_hold_what_the_encoder_of_the_sender_makes_of_what_it_saw() {
+        let mut layout = layout();
+        let encoder = MaddpgConfig { messages: Messages::Encoder, message_width: Some(3), ..MaddpgConfig::default() };
+        let agents: Vec<&AgentSpec> = layout.agents.iter().collect();
+        let mut learner = Maddpg::new(&agents, Activation::Tanh, encoder, &Seeds::new(1)).unwrap();
+        layout.agents.iter_mut().for_each(|agent| agent.message = 3);
+        let config = DumieConfig { pairs: PairSource::Replay, ..config() };
+        let dumie = Dumie::new(&layout, config, [1.0, 1.0], &Seeds::new(1)).unwrap();
+        let (replay, mut rng, mut pairs) = (replay(20), Seeds::new(3).stream("f"), Pairs::default());
+        let (mut seen, mut sent, mut tape) = (Vec::new(), Vec::new(), Tape::default());
+        assert!(dumie.filter((Class::Delivered, 0), &replay, &mut rng, &mut pairs, Some(&mut seen)));
+        learner.encode(&seen, pairs.len(), &mut sent);
+        let [x, y] = pairs.of([&sent, &replay.actions]);
+        let (actors, params) = (&learner.actors, learner.params.actors.read());
+        for pair in 0..256 {
+            let (start, width) = (x.starts[pair] as usize, x.widths[pair]);
+            let sender = start % 6 / 3;
+            let heard = seen[2 * pair + sender];
+            assert_eq!((start, width), (6 * pair + 3 * sender, 3));
+            assert_eq!(y.data[y.starts[pair] as usize], heard, "on delivered links the receiver does what it heard");
+            let exact = actors.encoders[sender].forward(&params[actors.encoder_range(sender)], &[heard], 1, &mut tape);
+            assert!(exact.iter().zip(&sent[start..]).all(|(a, b)| (a - b).abs() < 1e-6));
+        }
+    }
+
+    #[test]
     fn the_bonus_is_alpha_jsd_where_delivered_and_minus_beta_club_where_lost() {
         let row = |delivered| Batch {
             rows: 2,
@@ -461,6 +489,11 @@ mod tests {
         let [one, two] = [bonus([1.0, 0.0], true), bonus([2.0, 5.0], true)];
         assert!(one.iter().all(|&b| b != 0.0) && one.iter().zip(&two).all(|(a, b)| (2.0 * a - b).abs() < 1e-5));
         assert_eq!(bonus([1.0, 0.0], false), [0.0, 0.0]);
+        // what encoders sent stands in for the observations
+        let sent = Batch { observations: vec![9.0; 4], messages: row(true).observations, ..row(true) };
+        let mut encoded = Vec::new();
+        trained([1.0, 0.0]).bonus(&sent, &mut Seeds::new(5).stream("b"), &mut encoded);
+        assert_eq!(encoded, one);
         let [one, two] = [bonus([0.0, 1.0], false), bonus([9.0, 2.0], false)];
         assert!(one.iter().all(|&b| b != 0.0) && one.iter().zip(&two).all(|(a, b)| (2.0 * a - b).abs() < 1e-5));
     }

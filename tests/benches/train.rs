@@ -157,7 +157,7 @@ fn main() {
         ("messages", MaddpgConfig::default(), None),
         ("encoded messages", encoder.clone(), None),
         ("cc-maddpg 16 negatives", MaddpgConfig::default(), with(Negatives::Count(16))),
-        ("cc-maddpg 16 negatives, encoded", encoder.clone(), with(Negatives::Count(16))),
+        ("cc-maddpg encoded messages", encoder.clone(), with(Negatives::Count(16))),
         ("cc-maddpg all negatives", MaddpgConfig::default(), with(Negatives::All)),
         ("no messages per-agent", per_agent(off), None),
         ("messages per-agent", per_agent(MaddpgConfig::default()), None),
