@@ -8,12 +8,15 @@ use clap::ValueHint;
 use super::args::end_on_signals;
 use super::estimates::{class, place, print, split, writer};
 use super::jobs::{Gathered, gather};
+use super::large::{self, Input};
 use super::outputs::Picture;
-use super::{Outcome, heatmap, ui};
+use super::plot::{self, View};
+use super::{Outcome, ui};
 use crate::Error;
 use crate::mi::{self, ESTIMATORS, Estimate, Plan, Protocol};
 use crate::pairs::{self, PairsError, TableOptions};
 use crate::registry::{Spec, find};
+use crate::rng::Seeds;
 use crate::schema::Samples;
 use crate::{io, storage};
 
@@ -25,8 +28,10 @@ Examples:
   ccmarl estimate-mi table.parquet --x a,b --y c --estimator gaussian,jsd --group subject
   ccmarl estimate-mi table.csv --x a --y b --estimator ksg,ksg:10,gcmi
   ccmarl estimate-mi table.csv --x a --y b --given c --estimator gaussian,ksg --unit bits
+  ccmarl estimate-mi table.csv --x a --y b --estimator gaussian,ksg,infonce --plot pair.svg
   ccmarl estimate-mi table.csv --all-pairs --estimator gcmi --plot pairs.svg
   ccmarl estimate-mi table.csv --x 'regex:^obs_' --y action --time t --lag 0..10 --estimator ksg
+  ccmarl estimate-mi table.csv --x a --y b --estimator auto --sample 10000
   ccmarl estimate-mi table.csv --x job --y city --estimator discrete --format csv
   ccmarl estimate-mi table.csv --x a --y b --time t --out result.json
 
@@ -79,6 +84,13 @@ pub(super) struct Args {
     /// Table: column that orders the rows; without --group all rows are one series, cut into blocks
     #[arg(long, value_name = "COLUMN", requires = "table")]
     time: Option<String>,
+    /// Table: estimate from so many rows, drawn at random. A table over --memory is sampled without it (1,000,000 rows),
+    /// but for gaussian and discrete, which read all rows once
+    #[arg(long, value_name = "N", requires = "table", value_parser = clap::value_parser!(u32).range(10..))]
+    sample: Option<u32>,
+    /// Table: the largest that is held in memory, MiB of numbers or of text; a larger one is read in pieces
+    #[arg(long, value_name = "MIB", default_value_t = 256)]
+    memory: u32,
     /// Store: delivered messages only
     #[arg(long, conflicts_with_all = ["lost", "table"])]
     delivered: bool,
@@ -103,7 +115,8 @@ pub(super) struct Args {
     /// Also write the rows to a .json, .csv or .parquet file
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     out: Option<PathBuf>,
-    /// Draw the first estimator's values as a heat map of links, or of --all-pairs: a .svg or .png file
+    /// Draw a .svg or .png file: of one pair its points, estimates with intervals, the value on halves and quarters of the
+    /// samples, training; of several lags the values over them; of links or --all-pairs a heat map of the first estimator
     #[arg(long, value_name = "FILE", value_hint = ValueHint::FilePath)]
     plot: Option<PathBuf>,
     /// Replace --out and --plot if they exist
@@ -170,25 +183,26 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     end_on_signals()?;
     let plan = plan(args)?;
     let write = args.out.as_deref().map(|path| writer(path, &args.path, args.force)).transpose()?;
-    let plot = args.plot.as_deref().map(|path| Picture::at(path, args.force)).transpose()?;
-    if plot.is_some() {
-        refuse_undrawable(args)?;
-    }
-    let samples = Arc::new(samples(args)?);
-    let plan = Arc::new(plan);
-    let total = samples.len() * plan.estimators.len();
+    let plot = args.plot.as_deref().map(|path| Ok((view(args)?, Picture::at(path, args.force)?)));
+    let plot = plot.transpose().map_err(|error: Error| error)?;
+    let estimators = plan.estimators.len();
+    let Input { samples, plan, places, results } = input(args, plan)?;
+    let (samples, plan) = (Arc::new(samples), Arc::new(plan));
     let (own_samples, own_plan) = (Arc::clone(&samples), Arc::clone(&plan));
+    let total = samples.len() * plan.estimators.len();
     let Gathered { told, interrupted } = gather(args.threads, total, "estimating", move |stop, tell| {
         mi::run_each(&own_samples, &own_plan, stop, &|place, result| tell((place, result)));
     })?;
+    let placed = told.into_iter().map(|(place, result)| (places.as_ref().map_or(place, |of| of[place]), result));
+    let told: Vec<(usize, mi::JobResult)> = results.into_iter().chain(placed).collect();
     if interrupted {
-        let done = told.len();
-        ui::say(&format!("interrupted: {done} of {total} estimates are finished, and only these are shown"));
+        let (done, all) = (told.len(), samples.len() * estimators);
+        ui::say(&format!("interrupted: {done} of {all} estimates are finished, and only these are shown"));
         if told.iter().all(|(_, result)| result.rows.is_err()) {
             return Ok(Outcome::Interrupted);
         }
     }
-    let (mut rows, failures) = split(mi::in_order(told, &plan))?;
+    let (mut rows, failures) = split(mi::in_order(told, estimators))?;
     if args.unit == InUnit::Bits {
         rows = rows.into_iter().map(Estimate::in_bits).collect();
     }
@@ -204,8 +218,12 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         Form::Parquet => ui::print_bytes(&mi::to_parquet(&rows).map_err(anyhow::Error::msg)?),
     };
     // after the results, which a picture that cannot be drawn must not take away, and even if nobody reads them
-    if !interrupted {
-        plot.map_or(Ok(()), |target| heatmap::draw(&rows, &target))?;
+    if let Some((view, target)) = plot.filter(|_| !interrupted) {
+        let failed: Vec<&str> = failures.iter().map(|(job, _)| job.estimator.as_str()).collect();
+        if !plot::draw(view, &rows, &failed, (&samples, &plan), args.threads, &target)? {
+            ui::say("interrupted: all estimates are shown, and no picture was drawn");
+            return Ok(Outcome::Interrupted);
+        }
     }
     printed?;
     for (job, error) in &failures {
@@ -219,17 +237,17 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// A heat map has one cell per pair: several lags would fall into one, and columns that are moved in time are other
-/// columns on one axis only.
-fn refuse_undrawable(args: &Args) -> Result<(), Error> {
-    let message = if !args.all_pairs && !args.x.is_empty() {
-        "--plot draws a matrix: give --all-pairs, or a store"
-    } else if args.lag.len() > 1 {
-        "--plot draws one lag: give --lag one number"
-    } else if args.all_pairs && args.lag.iter().any(|&lag| lag > 0) {
-        "--plot of --all-pairs is for columns at the same time: leave out --lag"
-    } else {
-        return Ok(());
+/// What `--plot` shows. A heat map has one cell per pair: several lags would fall into one, and columns that are moved
+/// in time are other columns on one axis only.
+fn view(args: &Args) -> Result<View, Error> {
+    let message = match (args.all_pairs, args.lag.len() > 1) {
+        (false, true) => return Ok(View::Lags),
+        (false, false) if !args.x.is_empty() => return Ok(View::Pair),
+        (true, true) => "--plot of --all-pairs draws one lag: name one pair by --x and --y to see all",
+        (true, false) if args.lag.iter().any(|&lag| lag > 0) => {
+            "--plot of --all-pairs is for columns at the same time: leave out --lag"
+        }
+        _ => return Ok(View::Matrix),
     };
     Err(Error::Usage(message.to_owned()))
 }
@@ -252,7 +270,54 @@ pub(super) fn named(names: &[String]) -> Result<Vec<mi::Named>, Error> {
     Ok(estimators)
 }
 
+/// Samples, or what one pass over a table makes of it that memory does not hold.
+fn input(args: &Args, plan: Plan) -> anyhow::Result<Input> {
+    if args.sample.is_none() && (!args.x.is_empty() || args.all_pairs) && is_large(args)? {
+        if args.lag.iter().any(|&lag| lag > 0) {
+            let message = "--lag needs the rows in memory, and the table is larger than --memory: take a part of it";
+            return Err(Error::Usage(format!("{message}: {}", args.path.display())).into());
+        }
+        let mut options = options(args);
+        options.sample = Some(pairs::Sample { rows: large::SAMPLE, seeds: sample_seeds(args) });
+        let one_pass = !args.all_pairs && args.group.is_none() && args.time.is_none();
+        if one_pass {
+            return Ok(large::read(&args.path, options, plan, args.plot.is_some())?);
+        }
+        return Ok(Input { samples: of_table(args, &options)?, plan, places: None, results: Vec::new() });
+    }
+    Ok(Input { samples: samples(args)?, plan, places: None, results: Vec::new() })
+}
+
+fn is_large(args: &Args) -> Result<bool, Error> {
+    if !args.all_pairs && args.y.is_empty() {
+        return Ok(false);
+    }
+    let size = pairs::size(&args.path, &options(args))?;
+    Ok(size.is_some_and(|bytes| bytes > u64::from(args.memory) << 20))
+}
+
+fn sample_seeds(args: &Args) -> Seeds {
+    Seeds::new(args.seed).child("sample")
+}
+
+/// What the table is asked for.
+fn options(args: &Args) -> TableOptions {
+    TableOptions {
+        x: args.x.clone(),
+        y: args.y.clone(),
+        given: args.given.clone(),
+        group: args.group.clone(),
+        time: args.time.clone(),
+        sample: args.sample.map(|rows| pairs::Sample { rows: rows as usize, seeds: sample_seeds(args) }),
+    }
+}
+
 fn samples(args: &Args) -> Result<Vec<Samples>, Error> {
+    if args.sample.is_some() && args.lag.iter().any(|&lag| lag > 0) {
+        return Err(Error::Usage(
+            "--lag needs neighbouring rows, which --sample takes apart: leave out one".to_owned(),
+        ));
+    }
     let sets = unlagged(args)?;
     let (mut out, mut short) = (Vec::new(), Vec::new());
     for set in &sets {
@@ -274,22 +339,24 @@ fn samples(args: &Args) -> Result<Vec<Samples>, Error> {
     Ok(out)
 }
 
+fn of_table(args: &Args, options: &TableOptions) -> Result<Vec<Samples>, Error> {
+    if args.all_pairs {
+        let (sets, left_out) = pairs::all_pairs(&args.path, options)?;
+        for what in left_out {
+            ui::say(&format!("note: left out: {what}"));
+        }
+        return Ok(sets);
+    }
+    if options.y.is_empty() {
+        return Err(Error::Usage("--x needs --y, or --all-pairs".to_owned()));
+    }
+    Ok(vec![pairs::table(&args.path, options)?])
+}
+
 fn unlagged(args: &Args) -> Result<Vec<Samples>, Error> {
     let path = &args.path;
     if !args.x.is_empty() || args.all_pairs {
-        let (x, y, given) = (args.x.clone(), args.y.clone(), args.given.clone());
-        let options = TableOptions { x, y, given, group: args.group.clone(), time: args.time.clone() };
-        if args.all_pairs {
-            let (sets, left_out) = pairs::all_pairs(path, &options)?;
-            for what in left_out {
-                ui::say(&format!("note: left out: {what}"));
-            }
-            return Ok(sets);
-        }
-        if options.y.is_empty() {
-            return Err(Error::Usage("--x needs --y, or --all-pairs".to_owned()));
-        }
-        return Ok(vec![pairs::table(path, &options)?]);
+        return of_table(args, &options(args));
     }
     if !pairs::is_store(path)? {
         return Err(PairsError::NoColumns(path.clone()).into());

@@ -59,6 +59,15 @@ pub(super) fn place(labels: &SampleLabels) -> String {
     }
 }
 
+/// What stands before a value that is a bound.
+pub(super) fn sign(kind: Kind) -> &'static str {
+    match kind {
+        Kind::LowerBound => "≥ ",
+        Kind::UpperBound => "≤ ",
+        Kind::Estimate => "",
+    }
+}
+
 /// Four decimals, and no minus sign before a zero.
 pub(super) fn decimals(value: f64) -> String {
     let text = format!("{value:.4}");
@@ -78,11 +87,7 @@ pub(super) fn print(rows: &[Estimate], samples: &[Samples]) -> anyhow::Result<()
     let mut before = String::new();
     for row in rows {
         let here = places.next().flatten().map(place).unwrap_or_default();
-        let sign = match row.kind {
-            Kind::LowerBound => "≥ ",
-            Kind::UpperBound => "≤ ",
-            Kind::Estimate => "",
-        };
+        let sign = sign(row.kind);
         let value = if row.value.is_infinite() {
             "infinite (copy)".to_owned()
         } else {

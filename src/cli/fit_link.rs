@@ -98,7 +98,7 @@ fn print(fit: &Fit) -> anyhow::Result<()> {
     let facts = [
         ("model", fit.model.to_owned()),
         ("episodes", fit.data.used.to_string()),
-        ("messages", fit.messages.to_string()),
+        ("messages, final rows too", fit.messages.to_string()),
         ("lost", format!("{} ({:.2} %)", fit.lost, 100.0 * fit.lost as f64 / fit.messages as f64)),
         ("data sha256", fit.data.sha256.clone()),
     ];

@@ -149,6 +149,7 @@ impl Summary {
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     end_on_signals()?;
     let whole = if let Some(store) = &args.store {
+        ui::say_left_beside(store);
         if let Some(out) = &args.out {
             refuse_existing(out, args.force).map_err(Error::from)?;
             storage::refuse_within_store(out).map_err(Error::from)?;
@@ -247,7 +248,8 @@ fn print_tables(s: &Summary) -> anyhow::Result<()> {
     };
     let mut rows: Vec<Vec<String>> = s.loss.iter().map(link).collect();
     rows.push(vec!["all".to_owned(), String::new(), String::new(), percent(s.loss_rate)]);
-    ui::print_table(&["sender → receiver", "messages", "lost", "loss rate"], &rows)
+    ui::print_table(&["sender → receiver", "messages", "lost", "loss rate"], &rows)?;
+    ui::print("messages: those of steps; the final rows of episodes, on which nobody acts, are not counted")
 }
 
 /// A plugin of the manifest on one line: its name, then what else it says.

@@ -13,7 +13,7 @@ use super::ui;
 /// How often signals are looked for.
 const LOOK: Duration = Duration::from_millis(50);
 /// Time between two lines about the jobs where stderr is no terminal.
-const LINE_EVERY: Duration = Duration::from_secs(10);
+pub(super) const LINE_EVERY: Duration = Duration::from_secs(10);
 
 /// What jobs told before they ended, or before a signal.
 pub(super) struct Gathered<T> {
@@ -71,7 +71,7 @@ pub(super) fn gather<T: Send + 'static>(
 }
 
 /// One line about jobs: how many are finished, and how long the others take if they are alike.
-fn line(what: &str, done: usize, total: usize, elapsed: Duration) -> String {
+pub(super) fn line(what: &str, done: usize, total: usize, elapsed: Duration) -> String {
     let left = elapsed.as_secs_f64() / done as f64 * (total - done.min(total)) as f64;
     let eta = if left.is_finite() {
         indicatif::HumanDuration(Duration::from_secs(left as u64)).to_string()

@@ -8,9 +8,9 @@ use serde_json::{Map, Value, json};
 
 use super::Outcome;
 use super::ui::{self, Format};
-use crate::link;
 use crate::registry::{self, Entry, RegistryError, Spec};
 use crate::scenario;
+use crate::{algo, link};
 
 /// The profiles of every scenario.
 const PROFILES: [&str; 2] = ["paper", "mpe2"];
@@ -25,7 +25,7 @@ const KINDS: &[(&str, List)] = &[
     ("policy", |kind| listed(kind, crate::record::POLICIES)),
     ("format", |kind| listed(kind, crate::storage::FORMATS)),
     ("estimator", |kind| listed(kind, crate::mi::ESTIMATORS)),
-    ("algorithm", |kind| listed(kind, crate::algo::ALGORITHMS)),
+    ("algorithm", |kind| listed(kind, algo::ALGORITHMS)),
     ("figure", |kind| listed(kind, crate::figure::FIGURES)),
     ("suite", suites),
     ("channel", channels),
@@ -49,7 +49,7 @@ pub(super) struct Args {
     /// Only plugins of this kind
     #[arg(value_name = "KIND", value_parser = PossibleValuesParser::new(KINDS.iter().map(|(kind, _)| *kind)))]
     kind: Option<String>,
-    /// Only this one; a scenario shows its parameters and their defaults, for --set
+    /// Only this one, with its parameters: a scenario's defaults (for --set), a link's, an algorithm's prior
     #[arg(requires = "kind")]
     name: Option<String>,
     /// How to print the list
@@ -82,12 +82,25 @@ fn one(all: &[Listed], kind: &str, name: &str, format: Format) -> anyhow::Result
         let kind = all.first().map_or("plugin", |plugin| plugin.kind);
         return Err(crate::Error::from(RegistryError::Unknown { kind, name: name.to_owned(), hint }).into());
     };
-    let parameters = if kind == "scenario" { parameters(name)? } else { Map::new() };
+    let (said, parameters) = match kind {
+        "scenario" => (String::new(), parameters(name)?),
+        "link" => {
+            let (link, parameters) = link_parameters(name);
+            (format!("parameters of {link}:"), parameters)
+        }
+        "algorithm" => ("what it stands for:".to_owned(), algorithm_parameters(name)?),
+        _ => (String::new(), Map::new()),
+    };
     if format == Format::Json {
         ui::print_json(&json!({ "plugin": plugin, "parameters": parameters }))?;
         return Ok(Outcome::Done);
     }
     ui::print(&format!("{kind} {}: {}\nreference: {}", plugin.syntax, plugin.summary, plugin.reference))?;
+    if !parameters.is_empty() && kind != "scenario" {
+        ui::print(&format!("\n{said}\n"))?;
+        let rows: Vec<Vec<String>> = parameters.iter().map(|(key, value)| vec![key.clone(), text(value)]).collect();
+        return ui::print_table(&["key", "value"], &rows).map(|()| Outcome::Done);
+    }
     if !parameters.is_empty() {
         let [first, second] = PROFILES;
         let cell = |value: &Value, profile: &str| text(&value[profile]);
@@ -96,6 +109,27 @@ fn one(all: &[Listed], kind: &str, name: &str, format: Format) -> anyhow::Result
         ui::print_table(&["key", "profile paper", "profile mpe2"], &rows.collect::<Vec<_>>())?;
     }
     Ok(Outcome::Done)
+}
+
+/// Values for the links that have no default for what stands behind the colon.
+const LINK_VALUES: [&str; 4] = ["dropout:0.2", "markov:medium", "distance:3", "mixture:perfect,dropout:0.5"];
+
+/// A link as it may stand on the command line, and its parameters; none of one that cannot do without a file.
+fn link_parameters(name: &str) -> (String, Map<String, Value>) {
+    let valued = LINK_VALUES.iter().find(|text| text.split(':').next() == Some(name)).unwrap_or(&name).to_string();
+    let task = scenario::build(&Spec::new(scenario::SCENARIOS[0].name)).ok();
+    let link = task.zip(Spec::parse("link", link::LINKS, &valued).ok());
+    let link = link.and_then(|(task, spec)| link::build(&spec, &crate::record::link_setting(&*task)).ok());
+    let all = link.map(|link| link.parameters()).unwrap_or_default();
+    (valued, all.into_iter().filter(|(key, _)| key != "name").collect())
+}
+
+/// The prior of an algorithm, and whether it shapes rewards.
+fn algorithm_parameters(name: &str) -> anyhow::Result<Map<String, Value>> {
+    let entry = registry::find("algorithm", algo::ALGORITHMS, name).map_err(crate::Error::from)?;
+    let preset = (entry.build)();
+    let all = json!({ "prior": preset.prior.to_string(), "shaping": preset.shaped });
+    Ok(all.as_object().cloned().unwrap_or_default())
 }
 
 /// The parameters of a scenario: key → profile → default.

@@ -9,13 +9,14 @@ mod estimates;
 mod evaluate;
 mod fit_link;
 mod generate;
-mod heatmap;
 mod inspect;
 mod jobs;
+mod large;
 mod link;
 mod list;
 mod outputs;
 mod pairs;
+mod plot;
 mod quickstart;
 mod record;
 mod recover;
@@ -77,7 +78,7 @@ enum Command {
     Report(report::ReportArgs),
     /// List what can be named on the command line: scenarios, links, policies, estimators, algorithms, …
     List(list::Args),
-    /// Generate shell completions or manual pages
+    /// Generate shell completions, manual pages, or a table of known information
     Generate(generate::Args),
 }
 

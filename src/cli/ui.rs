@@ -73,6 +73,17 @@ pub(super) fn say(text: &str) {
     }
 }
 
+/// Says when something unfinished lies beside a store.
+pub(super) fn say_left_beside(store: &std::path::Path) {
+    if let Some(left) = crate::storage::left_beside(store) {
+        let (left, store) = (left.display(), store.display());
+        say(&format!(
+            "note: beside it lies what did not finish; `ccmarl recover --force {store}` puts its whole episodes in place of \
+             this store: {left}"
+        ));
+    }
+}
+
 /// A progress bar with rate and ETA on stderr; silent when stderr is no terminal.
 pub(super) fn progress(total: u64, what: &'static str) -> ProgressBar {
     let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(8));
@@ -141,12 +152,23 @@ fn run_line(step: u64, total: u64, rate: f64, return_mean: Option<f64>) -> Strin
     format!("step {step} of {total} ({share:.0} %){earned}, {rate:.0} steps/s, ETA {eta}")
 }
 
+/// An error with its causes, each of them once: some tell their cause themselves.
+fn one_line(error: &anyhow::Error) -> String {
+    let mut text = error.to_string();
+    for cause in error.chain().skip(1).map(ToString::to_string) {
+        if !text.contains(&cause) {
+            text = format!("{text}: {cause}");
+        }
+    }
+    text
+}
+
 /// Prints an error once, as one line, and gives its exit code: 2 when the user's words are at fault, else 1.
 pub(super) fn report_error(error: &anyhow::Error) -> ExitCode {
     if error.is::<BrokenPipe>() {
         return ExitCode::SUCCESS;
     }
-    eprintln!("error: {}", crate::io::printable(&format!("{error:#}")));
+    eprintln!("error: {}", crate::io::printable(&one_line(error)));
     let own = || error.chain().filter_map(|e| e.downcast_ref::<crate::Error>());
     for line in own().filter_map(crate::Error::excerpt).flat_map(str::lines) {
         eprintln!("  {}", crate::io::printable(line));
@@ -158,6 +180,17 @@ pub(super) fn report_error(error: &anyhow::Error) -> ExitCode {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_cause_that_an_error_tells_itself_is_not_told_again() {
+        let source = || std::io::Error::other("is a directory");
+        let own = crate::io::IoError::os("read", std::path::Path::new("d"))(source());
+        assert_eq!(one_line(&crate::Error::from(own).into()), "could not read: is a directory: d");
+        assert_eq!(
+            one_line(&anyhow::Error::from(source()).context("could not start")),
+            "could not start: is a directory"
+        );
+    }
 
     #[test]
     fn a_line_about_a_run_says_how_far_how_well_how_fast_and_how_long_still() {

@@ -75,6 +75,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     };
     let report = storage::verify(&args.store, &mut watch);
     bar.finish_and_clear();
+    ui::say_left_beside(&args.store);
     let mut report = report.map_err(Error::from)?;
     let again = again.transpose().unwrap_or_else(|error| {
         let (place, message) = ("manifest".to_owned(), error.to_string());

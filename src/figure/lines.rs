@@ -1,4 +1,4 @@
-//! What the figures of links share: curves with bands over an x axis of their own, from 0 up.
+//! What figures of curves share: bands or whiskers over an x axis of their own, from 0 up, or from the least value below.
 
 use plotters::prelude::*;
 
@@ -35,7 +35,7 @@ struct Figure<'a> {
 /// Draws curves: a band where points have one, else a line alone.
 pub(super) fn render(how: &Lines, data: &Data, curves: &[Curve], target: Target<'_>) -> Result<(), FigureError> {
     let figure = how.name;
-    let (mut left, mut right, mut top) = (f64::INFINITY, f64::NEG_INFINITY, 0.0_f64);
+    let (mut left, mut right, mut bottom, mut top) = (f64::INFINITY, f64::NEG_INFINITY, 0.0_f64, 0.0_f64);
     for (curve, point) in curves.iter().flat_map(|c| c.points.iter().map(move |p| (c, p))) {
         let (low, high) = point.band.unwrap_or((point.value, point.value));
         for value in [point.step, point.value, low, high] {
@@ -44,15 +44,19 @@ pub(super) fn render(how: &Lines, data: &Data, curves: &[Curve], target: Target<
                 return Err(FigureError::NotFinite { figure, what, value });
             }
         }
-        (left, right, top) = (left.min(point.step), right.max(point.step), top.max(high).max(point.value));
+        (left, right) = (left.min(point.step), right.max(point.step));
+        (bottom, top) = (bottom.min(low).min(point.value), top.max(high).max(point.value));
     }
     if left > right {
         return Err(FigureError::Empty { figure, needs: how.needs });
     }
     let shown = data.series.iter().enumerate().filter(|(_, s)| curves.iter().any(|c| c.series == **s));
     let colors = shown.map(|(i, s)| (s.clone(), style::color(i))).collect();
-    let (x, y) =
-        if how.diagonal { (0.0..1.0, 0.0..1.0) } else { (style::axis(left, right), 0.0..(1.06 * top).max(1e-3)) };
+    let (x, y) = if how.diagonal {
+        (0.0..1.0, 0.0..1.0)
+    } else {
+        (style::axis(left, right), 1.06 * bottom..(1.06 * top).max(1e-3))
+    };
     let (curves, y) = if how.log { logarithms(curves, y.end) } else { (curves.to_vec(), y) };
     style::render(&Figure { how, data, curves, colors, x, y }, target)
 }

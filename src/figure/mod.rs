@@ -11,13 +11,17 @@ mod learning_curves;
 mod lines;
 mod loss_by_distance;
 mod loss_by_step;
+mod mi_by_lag;
 mod mi_heatmap;
+mod mi_pair;
+mod pair;
 mod reliability;
 mod scaling;
 mod style;
 
 use std::path::{Path, PathBuf};
 
+pub use self::pair::{Pair, Shrunk, Training, Whisker};
 use crate::registry::Entry;
 
 /// All figures.
@@ -31,6 +35,8 @@ pub const FIGURES: &[Entry<Render>] = &[
     burst_lengths::ENTRY,
     loss_by_distance::ENTRY,
     calibration::ENTRY,
+    mi_pair::ENTRY,
+    mi_by_lag::ENTRY,
 ];
 
 /// Draws a figure from `data` onto a target.
@@ -68,6 +74,10 @@ pub struct Data {
     pub bursts: Vec<Curve>,
     /// Loss by distance, world units, each the `step` of its point.
     pub loss_by_distance: Vec<Curve>,
+    /// Mutual information by lag in rows, each the `step` of its point.
+    pub mi_by_lag: Vec<Curve>,
+    /// One pair of samples.
+    pub pair: Pair,
     /// Bars by group and series.
     pub bars: Vec<Bar>,
     /// Horizontal lines of constant value (random policy, oracle).
@@ -228,6 +238,26 @@ mod tests {
             loss_by_step: shares(),
             bursts: shares(),
             loss_by_distance: shares(),
+            mi_by_lag: shares(),
+            pair: Pair {
+                names: ["<b>x".to_owned(), "\u{1}".to_owned()],
+                points: (0..50).map(|i| (f64::from(i), f64::from(i * i % 17))).collect(),
+                estimates: vec![
+                    Whisker { label: "<b>\u{1}".to_owned(), sign: "", value: 0.4, band: Some((0.3, 0.5)) },
+                    Whisker { label: "club".to_owned(), sign: "≤ ", value: 1.4, band: None },
+                ],
+                shrunk: Some(Shrunk {
+                    label: "<b>".to_owned(),
+                    points: vec![(50.0, 0.4), (25.0, 0.5), (25.0, 0.45)],
+                    line: (0.35, 3.0),
+                }),
+                trainings: vec![Training {
+                    label: "<b>".to_owned(),
+                    score: "<b>".to_owned(),
+                    looks: vec![(0.0, 0.0, 0.0), (25.0, 0.3, 0.2)],
+                    chosen: 25.0,
+                }],
+            },
             bars: vec![bar("unrestricted", -80.0), bar("none", -120.0)],
             references: vec![Reference { label: "random".to_owned(), value: -200.0 }],
             cells: vec![cell("delivered", 0.4133), cell("lost", f64::NAN)],
@@ -268,6 +298,8 @@ mod tests {
                 "figure burst-lengths: expected at least one burst, found none",
                 "figure loss-by-distance: expected at least one bin of distance with messages, found none",
                 "figure calibration: expected at least one bar, found none",
+                "figure mi-pair: expected at least one point, found none",
+                "figure mi-by-lag: expected at least one lag with a value, found none",
             ]
         );
     }

@@ -123,6 +123,18 @@ pub(super) fn decimals(range: f64) -> usize {
     }
 }
 
+/// A tick as short as it can be: the decimals that the axis needs, or a power of ten where numbers are long.
+pub(super) fn short(value: f64, range: f64) -> String {
+    let largest = value.abs();
+    if largest >= 1e5 || range < 1e-3 && largest > 0.0 {
+        let text = format!("{value:.2e}");
+        let (digits, exponent) = text.split_once('e').unwrap_or((&text, "0"));
+        let digits = digits.trim_end_matches('0').trim_end_matches('.');
+        return format!("{}e{}", digits.replace('-', "−"), exponent.replace('-', "−"));
+    }
+    number(value, decimals(range))
+}
+
 /// An axis that holds `low..high` with a little air, never of zero length.
 pub(super) fn axis(low: f64, high: f64) -> std::ops::Range<f64> {
     let air = 0.05 * (high - low).max(high.abs().max(low.abs()) * 1e-3).max(1e-6);
@@ -202,6 +214,16 @@ type Ticks<'a> = &'a dyn Fn(&f64) -> String;
 /// Grid, ticks as the closures write them, and axis names.
 pub(super) fn mesh_with<DB: DrawingBackend>(
     chart: &mut Chart<'_, DB>,
+    y: (&str, Ticks<'_>),
+    x: (Option<&str>, Ticks<'_>),
+) -> Drawn<DB> {
+    mesh_of(chart, [8, 8], y, x)
+}
+
+/// The same with at most so many ticks on x and on y.
+pub(super) fn mesh_of<DB: DrawingBackend>(
+    chart: &mut Chart<'_, DB>,
+    [across, up]: [usize; 2],
     (y_name, y_label): (&str, Ticks<'_>),
     (x_name, x_label): (Option<&str>, Ticks<'_>),
 ) -> Drawn<DB> {
@@ -213,10 +235,10 @@ pub(super) fn mesh_with<DB: DrawingBackend>(
         .axis_style(SOFT.stroke_width(2))
         .label_style(text(TICK, INK, HPos::Left, VPos::Top))
         .axis_desc_style(text(LABEL, INK, HPos::Left, VPos::Top))
-        .x_labels(if x_name.is_some() { 8 } else { 0 })
+        .x_labels(if x_name.is_some() { across } else { 0 })
         .x_desc(x_name.unwrap_or(""))
         .x_label_formatter(x_label)
-        .y_labels(8)
+        .y_labels(up)
         .y_desc(label(y_name, 60))
         .y_label_formatter(&y_label)
         .draw()
@@ -254,4 +276,15 @@ pub(super) fn draw_references<DB: DrawingBackend>(chart: &mut Chart<'_, DB>, ref
         chart.draw_series(DashedLineSeries::new(ends, 14, 10, style))?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ticks_are_short_and_have_a_true_minus_sign() {
+        assert_eq!([short(-0.25, 1.0), short(250_000.0, 1e6)], ["−0.2", "2.5e5"]);
+        assert_eq!([short(-3.0e-5, 1e-4), short(0.0, 1e-4), short(12.0, 100.0)], ["−3e−5", "0.000", "12"]);
+    }
 }

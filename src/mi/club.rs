@@ -34,7 +34,7 @@
 //! permutation; the log-variance is not confined to (−1, 1). The leave-one-out mean runs over at most 512 others.
 
 use super::conditional::{ConditionalTape, GaussianConditional};
-use super::fit::{Fit, Model, fit, nothing_learnt, silence};
+use super::fit::{Fit, Model, Training, fit, nothing_learnt, silence, training};
 use super::prepare::{Prepared, gather, prepare, tied};
 use super::{
     Build, Estimate, Estimator, Kind, MiError, Protocol, Unit, block_interval, losses, p_value, permuted_rows,
@@ -68,6 +68,23 @@ struct Trainee {
     tape: ConditionalTape,
     grad_mu: Vec<f32>,
     grad_logvar: Vec<f32>,
+}
+
+impl Trainee {
+    fn new(data: &Prepared) -> Self {
+        Self {
+            q: GaussianConditional::deep(data.x_width, data.y_width),
+            tape: ConditionalTape::default(),
+            grad_mu: Vec::new(),
+            grad_logvar: Vec::new(),
+        }
+    }
+}
+
+/// The training of q.
+pub(super) fn q_training(samples: &Samples, seeds: &Seeds) -> Option<Training> {
+    let data = prepare(samples, seeds).ok()?;
+    training(&mut Trainee::new(&data), "mean ln q, nats", &data, seeds)
 }
 
 impl Model for Trainee {
@@ -112,6 +129,10 @@ impl Estimator for Club {
             fitted.row("club-fit", Kind::Estimate, &fitted.held.gain(&fitted.data), p)?,
         ])
     }
+
+    fn training(&self, samples: &Samples, seeds: &Seeds) -> Option<Training> {
+        q_training(samples, seeds)
+    }
 }
 
 /// q fitted to the training part, on the held-out part.
@@ -127,12 +148,7 @@ pub(super) struct Fitted<'a> {
 impl<'a> Fitted<'a> {
     pub(super) fn new(samples: &'a Samples, seeds: &Seeds) -> Result<Self, MiError> {
         let data = prepare(samples, seeds)?;
-        let mut model = Trainee {
-            q: GaussianConditional::deep(data.x_width, data.y_width),
-            tape: ConditionalTape::default(),
-            grad_mu: Vec::new(),
-            grad_logvar: Vec::new(),
-        };
+        let mut model = Trainee::new(&data);
         let Fit { params, steps, .. } = fit(&mut model, &data, seeds).ok_or_else(|| diverged(samples))?;
         let held = Held::new(&mut model, &params, samples, &data);
         let fit_gain = block_interval(&held.gain(&data), &data.test_blocks);

@@ -26,8 +26,8 @@
 //!
 //! Held-out value; a derangement instead of a permutation.
 
-use super::club::Fitted;
-use super::{Build, Estimate, Estimator, Kind, MiError, Protocol};
+use super::club::{Fitted, q_training};
+use super::{Build, Estimate, Estimator, Kind, MiError, Protocol, Training};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::{self, Seeds};
 use crate::schema::Samples;
@@ -57,5 +57,9 @@ impl Estimator for ClubSample {
         let log_q = |i: usize, x: usize| fitted.held.log_q(i, test[x]);
         let values: Vec<f64> = others.iter().enumerate().map(|(i, &other)| log_q(i, i) - log_q(other, i)).collect();
         Ok(vec![fitted.row("club-sample", Kind::UpperBound, &values, p)?])
+    }
+
+    fn training(&self, samples: &Samples, seeds: &Seeds) -> Option<Training> {
+        q_training(samples, seeds)
     }
 }

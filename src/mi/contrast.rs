@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::bounds::{Objective, infonce};
-use super::fit::{Fit, Model, fit, nothing_learnt};
+use super::fit::{Fit, Model, Training, fit, nothing_learnt, training};
 use super::prepare::{Prepared, gather, prepare, tied};
 use super::scorer::{CriticKind, Scorer};
 use super::{
@@ -105,6 +105,23 @@ pub(super) struct Reader {
 }
 
 impl Contrast {
+    fn trainee(&self, data: &Prepared) -> Trainee {
+        Trainee {
+            scorer: Scorer::new(self.critic, data.x_width, data.y_width),
+            objective: self.objective,
+            negatives: self.critic.negatives(),
+            grad_positive: Vec::new(),
+            grad_negative: Vec::new(),
+        }
+    }
+
+    /// The training of the critic.
+    pub(super) fn training(&self, samples: &Samples, seeds: &Seeds) -> Option<Training> {
+        let data = prepare(samples, seeds).ok()?;
+        let score = if self.objective == Objective::JensenShannon { "2·JSD" } else { "bound, nats" };
+        training(&mut self.trainee(&data), score, &data, seeds)
+    }
+
     /// The name of the row.
     pub(super) fn full_name(&self) -> String {
         match self.critic {
@@ -115,13 +132,7 @@ impl Contrast {
 
     /// Trains a critic and reads it on the test part; `None` when no value was finite.
     pub(super) fn read(&self, data: &Prepared, seeds: &Seeds) -> Option<Reader> {
-        let mut model = Trainee {
-            scorer: Scorer::new(self.critic, data.x_width, data.y_width),
-            objective: self.objective,
-            negatives: self.critic.negatives(),
-            grad_positive: Vec::new(),
-            grad_negative: Vec::new(),
-        };
+        let mut model = self.trainee(data);
         let Fit { params, steps, .. } = fit(&mut model, data, seeds)?;
         let mut scorer = model.scorer;
         let held_out = data.train.len().min(data.test.len());

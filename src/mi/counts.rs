@@ -1,5 +1,7 @@
 //! Categories and how often they occur together: what the plug-in estimator needs.
 
+use std::collections::BTreeMap;
+
 use crate::schema::Columns;
 
 /// Largest contingency table that is kept as such, per sample; larger ones are counted by sorting.
@@ -85,6 +87,20 @@ impl Table {
         Self { n: n as f64, x: in_x, y: in_y, joint }
     }
 
+    /// From the count of each pair that occurs; categories are numbered from 0.
+    pub(super) fn of_counts(counts: &BTreeMap<(u32, u32), u32>) -> Self {
+        let mut out = Self { n: 0.0, x: Vec::new(), y: Vec::new(), joint: Vec::with_capacity(counts.len()) };
+        for (&(a, b), &count) in counts {
+            for (side, at) in [(&mut out.x, a as usize), (&mut out.y, b as usize)] {
+                side.resize(side.len().max(at + 1), 0);
+                side[at] += count;
+            }
+            out.n += f64::from(count);
+            out.joint.push(((a, b), count));
+        }
+        out
+    }
+
     /// ln p(x,y)/p(x)p(y) of a pair that occurs `count` times.
     fn term(&self, (a, b): (u32, u32), count: u32) -> f64 {
         let product = f64::from(self.x[a as usize]) * f64::from(self.y[b as usize]);
@@ -165,9 +181,12 @@ mod tests {
             let (x, y) = (draw(), draw());
             let rows: Vec<u32> = (0..n as u32).collect();
             let table = Table::new(&x, &y, &rows, &rows);
-            let mut map = std::collections::BTreeMap::new();
+            let mut map = BTreeMap::new();
             x.of.iter().zip(&y.of).for_each(|(&a, &b)| *map.entry((a, b)).or_insert(0) += 1);
-            assert_eq!(table.joint, map.into_iter().collect::<Vec<_>>());
+            assert_eq!(table.joint, map.clone().into_iter().collect::<Vec<_>>());
+            let counted = Table::of_counts(&map);
+            assert_eq!((counted.n, &counted.joint), (table.n, &table.joint));
+            assert_eq!((counted.information(), counted.degrees()), (table.information(), table.degrees()));
             let local = table.local(&x, &y, &rows, &rows);
             assert!((local.iter().sum::<f64>() / f64::from(n) - table.information()).abs() < 1e-12);
         }

@@ -38,14 +38,15 @@
 //! None known: equal to the published values of small tables (`datasets/tables`).
 
 use super::counts::{Categories, Table};
+use super::discrete_pass::DiscretePass;
 use super::given::NO_NULL;
-use super::interval::{Scatter, block_interval, t_quantile};
+use super::interval::{Interval, Scatter, block_interval, t_quantile};
 use super::part::Part;
 use super::unseen::{Strata, Unseen};
-use super::{Build, Estimate, Estimator, Kind, MiError, Protocol, Unit, p_value};
+use super::{Build, Estimate, Estimator, Kind, MiError, OnePass, Protocol, Unit, p_value};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
-use crate::schema::{Columns, Samples};
+use crate::schema::{SampleLabels, Samples};
 
 /// The registry's entry.
 pub(super) const ENTRY: Entry<Build> = Entry {
@@ -90,10 +91,6 @@ impl Estimator for Discrete {
         let (x, y) = z.as_ref().map_or((x.clone(), y.clone()), |z| (x.joined(z), y.joined(z)));
         let table = Table::new(&x, &y, rows, rows);
         let of_z = z.as_ref().map(|z| Table::new(z, z, rows, rows));
-        let entropy = of_z.as_ref().map_or(0.0, Table::information);
-        let strata = of_z.as_ref().map_or(1, |of_z| of_z.occurring()[0]);
-        let (value, degrees) = (table.information() - entropy, table.degrees() + (strata - 1) as f64);
-        let bias = degrees / (2.0 * n as f64);
         let mut terms = table.local(&x, &y, rows, rows);
         if let (Some(of_z), Some(z)) = (&of_z, &z) {
             terms.iter_mut().zip(of_z.local(z, z, rows, rows)).for_each(|(t, h)| *t -= h);
@@ -101,16 +98,71 @@ impl Estimator for Discrete {
         let local = block_interval(&terms, &samples.episodes());
         let all = Part::all(samples);
         let information = |from: &[u32]| Table::new(&x, &y, from, rows).information();
-        let mut warnings = samples.notes.clone();
+        let mut notes = samples.notes.clone();
         let null = match &z {
             None => Some(all.null(samples, *protocol, seeds, &information)),
             Some(z) => all.null_within(&z.cells(rows), *protocol, seeds, &information),
         };
         if null.is_none() {
-            warnings.push(NO_NULL.to_owned());
+            notes.push(NO_NULL.to_owned());
         }
-        let sides = [(distinct_x, &samples.x, &labels.x), (distinct_y, &samples.y, &labels.y)];
-        warnings.extend(sides.into_iter().filter_map(|(distinct, columns, label)| sparse(distinct, n, columns, label)));
+        let p = p_value(table.information(), null.as_deref().unwrap_or_default());
+        let words = [&samples.x, &samples.y].map(|c| (0..c.width()).any(|at| c.is_words(at)));
+        let strata = strata_of(z.as_ref(), [&x, &y], rows);
+        let counted = Counted { table, of_z, strata, distinct: [distinct_x, distinct_y], n, words };
+        Ok(counted.rows(labels, local, p, notes))
+    }
+
+    fn one_pass(&self) -> Option<Box<dyn OnePass>> {
+        Some(Box::<DiscretePass>::default())
+    }
+
+    fn takes_words(&self) -> bool {
+        true
+    }
+
+    fn takes_given(&self) -> bool {
+        true
+    }
+}
+
+/// Counts of categories, from which the rows follow.
+pub(super) struct Counted {
+    /// x and y, each with z if there is one.
+    pub(super) table: Table,
+    /// z with itself.
+    pub(super) of_z: Option<Table>,
+    /// Which value of z belongs to which categories.
+    pub(super) strata: Strata,
+    /// Categories of x, and of y.
+    pub(super) distinct: [usize; 2],
+    pub(super) n: usize,
+    /// Whether x, and y, hold words.
+    pub(super) words: [bool; 2],
+}
+
+impl Counted {
+    /// Plug-in information, nats.
+    pub(super) fn information(&self) -> f64 {
+        self.table.information() - self.of_z.as_ref().map_or(0.0, Table::information)
+    }
+
+    /// The two rows; `local` is the mean of the local terms with its error, `p` the p-value of both.
+    pub(super) fn rows(
+        &self,
+        labels: &SampleLabels,
+        local: Interval,
+        p: Option<f64>,
+        notes: Vec<String>,
+    ) -> Vec<Estimate> {
+        let (table, n) = (&self.table, self.n);
+        let strata = self.of_z.as_ref().map_or(1, |of_z| of_z.occurring()[0]);
+        let (value, degrees) = (self.information(), table.degrees() + (strata - 1) as f64);
+        let bias = degrees / (2.0 * n as f64);
+        let mut warnings = notes;
+        for (at, label) in [&labels.x, &labels.y].into_iter().enumerate() {
+            warnings.extend(sparse(self.distinct[at], n, self.words[at], label));
+        }
         // where pairs of categories occur a few times, their frequencies say little about the error either
         let crowded = table.pairs() * CROWDED > n;
         if crowded {
@@ -131,10 +183,9 @@ impl Estimator for Discrete {
         let chance = libm::sqrt(second.max(0.0)) / independent;
         let scatter = Scatter { seen: value, error: local.error, chance, n: independent };
         let (corrected, t) = (value - bias, t_quantile(local.blocks));
-        let p = p_value(table.information(), null.as_deref().unwrap_or_default());
         let (mut low, high) = scatter.around(corrected, t);
         if !crowded {
-            let unseen = Unseen::of(&table, &strata_of(z.as_ref(), [&x, &y], rows), n, independent);
+            let unseen = Unseen::of(table, &self.strata, n, independent);
             low = low.min(scatter.around(corrected - unseen.pairs / (2.0 * n as f64), t).0);
             low = low.min(Scatter { error: unseen.error, ..scatter }.around(unseen.value - bias, t).0);
         }
@@ -151,16 +202,8 @@ impl Estimator for Discrete {
             row.warnings.clone_from(&warnings);
             row
         };
-        let most = libm::log(distinct_x.min(distinct_y) as f64);
-        Ok(vec![row("discrete", value), row("discrete-mm", corrected.clamp(-chance, most))])
-    }
-
-    fn takes_words(&self) -> bool {
-        true
-    }
-
-    fn takes_given(&self) -> bool {
-        true
+        let most = libm::log(self.distinct[0].min(self.distinct[1]) as f64);
+        vec![row("discrete", value), row("discrete-mm", corrected.clamp(-chance, most))]
     }
 }
 
@@ -178,15 +221,11 @@ fn strata_of(z: Option<&Categories>, sides: [&Categories; 2], rows: &[u32]) -> S
 }
 
 /// Says when nearly every sample is a category of its own, and what to do.
-fn sparse(distinct: usize, n: usize, columns: &Columns, label: &str) -> Option<String> {
+fn sparse(distinct: usize, n: usize, words: bool, label: &str) -> Option<String> {
     if distinct <= 2 || distinct * 2 <= n {
         return None;
     }
-    let advice = if (0..columns.width()).any(|c| columns.is_words(c)) {
-        "merge categories"
-    } else {
-        "take ksg for continuous columns"
-    };
+    let advice = if words { "merge categories" } else { "take ksg for continuous columns" };
     Some(format!("{label} has {distinct} values in {n} samples: {advice}"))
 }
 
@@ -195,6 +234,7 @@ mod tests {
     use super::*;
     use crate::mi::run::tests::samples_of;
     use crate::rng;
+    use crate::schema::Columns;
 
     fn both(samples: &Samples) -> [Estimate; 2] {
         let rows = Discrete.estimate(samples, &Protocol { permutations: 99 }, &Seeds::new(1)).unwrap();

@@ -37,6 +37,17 @@ pub(super) struct Fit {
     pub(super) steps: usize,
 }
 
+/// A network under training, looked at again and again.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Training {
+    /// What the scores are, with their unit.
+    pub score: &'static str,
+    /// Steps, and the scores of the training and of the validation part after them.
+    pub looks: Vec<(usize, f64, f64)>,
+    /// Steps after which the network was best on the validation part: this is the one that is used.
+    pub chosen: usize,
+}
+
 /// Said of networks that never beat "x tells nothing" on the validation part, whose values are 0 by construction.
 pub(super) fn nothing_learnt(network: &str) -> String {
     format!(
@@ -54,6 +65,34 @@ pub(super) fn silence(mlp: &Mlp, params: &mut [f32]) {
 /// Trains on the training part and keeps the parameters that score best on the validation part; `None` when no score
 /// was finite.
 pub(super) fn fit<M: Model>(model: &mut M, data: &Prepared, seeds: &Seeds) -> Option<Fit> {
+    looked_at(model, data, seeds, &mut |_, _, _, _| ())
+}
+
+/// What [`fit`] does, looked at: the same training, since a score leaves the model as it was.
+pub(super) fn training<M: Model>(
+    model: &mut M,
+    score: &'static str,
+    data: &Prepared,
+    seeds: &Seeds,
+) -> Option<Training> {
+    let mut out = Training { score, ..Training::default() };
+    let (mut x, mut y) = (Vec::new(), Vec::new());
+    // as many rows as of the validation part: the scores of some models depend on how many there are
+    let looked = &data.train[..data.train.len().min(data.validation.len()).min(LOOK)];
+    gather(&data.x, data.x_width, looked, &mut x);
+    gather(&data.y, data.y_width, looked, &mut y);
+    let mut look = |model: &mut M, params: &[f32], step: usize, validation: f64| {
+        let train = model.score(params, &x, &y, looked.len(), &mut seeds.stream("validation"));
+        out.looks.push((step, train, validation));
+    };
+    out.chosen = looked_at(model, data, seeds, &mut look)?.steps;
+    Some(out)
+}
+
+/// What is told at every look: the model, its parameters, the step and the score of the validation part.
+type Look<'a, M> = &'a mut dyn FnMut(&mut M, &[f32], usize, f64);
+
+fn looked_at<M: Model>(model: &mut M, data: &Prepared, seeds: &Seeds, look: Look<'_, M>) -> Option<Fit> {
     let mut params = model.init(&mut seeds.stream("init"));
     let mut adam = Adam::new(AdamConfig::new(LEARNING_RATE), params.len());
     let (mut order_rng, mut loss_rng) = (seeds.stream("order"), seeds.stream("negatives"));
@@ -69,6 +108,7 @@ pub(super) fn fit<M: Model>(model: &mut M, data: &Prepared, seeds: &Seeds) -> Op
     for step in 0..=STEPS {
         if step % EVERY == 0 {
             let score = model.score(&params, &vx, &vy, looked.len(), &mut seeds.stream("validation"));
+            look(model, &params, step, score);
             if score.is_finite() && best.as_ref().is_none_or(|b| score > b.score) {
                 best = Some(Fit { params: params.clone(), score, steps: step });
                 waited = 0;
@@ -98,4 +138,45 @@ pub(super) fn fit<M: Model>(model: &mut M, data: &Prepared, seeds: &Seeds) -> Op
         }
     }
     best
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mi::prepare::prepare;
+    use crate::mi::run::tests::linear_samples;
+
+    /// y ≈ w x by least squares.
+    struct Line;
+
+    impl Model for Line {
+        const DECAY: f32 = 0.0;
+
+        fn init(&self, _: &mut Stream) -> Vec<f32> {
+            vec![0.0]
+        }
+
+        fn loss(&mut self, w: &[f32], x: &[f32], y: &[f32], n: usize, _: &mut Stream, grads: &mut [f32]) -> f64 {
+            let errors = || x.iter().zip(y).map(|(x, y)| (x, w[0] * x - y));
+            grads[0] += errors().map(|(x, e)| 2.0 * e * x).sum::<f32>() / n as f32;
+            errors().map(|(_, e)| f64::from(e * e)).sum::<f64>() / n as f64
+        }
+
+        fn score(&mut self, w: &[f32], x: &[f32], y: &[f32], n: usize, rng: &mut Stream) -> f64 {
+            -self.loss(w, x, y, n, rng, &mut [0.0])
+        }
+    }
+
+    #[test]
+    fn looking_at_the_training_changes_nothing_and_the_chosen_look_is_the_best() {
+        let seeds = Seeds::new(3);
+        let data = prepare(&linear_samples(0.4, 2000, 1, 4), &seeds).unwrap();
+        let plain = fit(&mut Line, &data, &seeds).unwrap();
+        let watched = training(&mut Line, "score", &data, &seeds).unwrap();
+        assert_eq!((watched.chosen, watched.looks[0].0), (plain.steps, 0));
+        let best = watched.looks.iter().max_by(|a, b| a.2.total_cmp(&b.2)).unwrap();
+        assert_eq!((best.0, best.2), (plain.steps, plain.score));
+        // 1 − ρ² of the variance stays
+        assert!((plain.params[0] - 0.4).abs() < 0.1 && (best.1 + 0.84).abs() < 0.12, "{best:?}");
+    }
 }

@@ -34,13 +34,14 @@
 
 use statrs::function::gamma::digamma;
 
+use super::gaussian_pass::GaussianPass;
 use super::given::residuals;
 use super::interval::{Scatter, block_interval, t_quantile};
 use super::knn::Points;
 use super::linear::{Moments, Symmetric};
 use super::part::Part;
 use super::prepare::{Scale, scales, some_of, tied};
-use super::{Build, Estimate, Estimator, Kind, MiError, Protocol, Unit, p_value};
+use super::{Build, Estimate, Estimator, Kind, MiError, OnePass, Protocol, Unit, p_value};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
 use crate::schema::{Columns, SampleLabels, Samples};
@@ -56,9 +57,9 @@ pub(super) const ENTRY: Entry<Build> = Entry {
 };
 
 /// Unexplained share of a column's variance under which it counts as a linear function of others.
-const COLLINEAR: f64 = 1e-10;
+pub(super) const COLLINEAR: f64 = 1e-10;
 /// Groups of the jackknife.
-const GROUPS: usize = 50;
+pub(super) const GROUPS: usize = 50;
 
 struct Gaussian;
 
@@ -76,6 +77,10 @@ impl Estimator for Gaussian {
 
     fn takes_given(&self) -> bool {
         true
+    }
+
+    fn one_pass(&self) -> Option<Box<dyn OnePass>> {
+        Some(Box::<GaussianPass>::default())
     }
 }
 
@@ -112,15 +117,7 @@ pub(super) fn estimate(name: &str, samples: &Samples, protocol: Protocol, seeds:
     } else {
         let local = local_information(samples, &x, &y, &total);
         out.n_effective = block_interval(&local, &blocks).n_effective;
-        // without dependence the value is χ² with d_x d_y degrees of freedom over 2n, whose scatter a jackknife misses
-        let (degrees, n) = ((dx * dy) as f64, out.n_effective);
-        let error = jackknife(&total, &parts, dx + dy + given, &information);
-        if parts.len() > 1 && error.is_finite() {
-            let scatter =
-                Scatter { seen: value + degrees / (2.0 * n), error, chance: libm::sqrt(degrees / 2.0) / n, n };
-            let (low, high) = scatter.around(value, t_quantile(parts.len()));
-            (out.interval_low, out.interval_high) = (Some(low), Some(high));
-        }
+        interval(&mut out, (dx * dy) as f64, &total, &parts, dx + dy + given, &information);
         if parts.len() < 10 {
             warnings.push(format!("few blocks: the interval rests on {} episodes", parts.len()));
         }
@@ -214,12 +211,16 @@ fn groups(blocks: &[u32]) -> Vec<usize> {
 /// Bias-corrected information in nats; infinite when x determines a column of y. `given` columns of z have been taken
 /// out of x and y, and cost a degree of freedom each.
 fn information(moments: &Moments, dx: usize, dy: usize, given: usize) -> f64 {
-    let joint = moments.covariance();
+    information_of(&moments.covariance(), moments.n, dx, dy, given)
+}
+
+/// The same by the covariance of x and y, taken over `n` samples.
+pub(super) fn information_of(joint: &Symmetric, n: f64, dx: usize, dy: usize, given: usize) -> f64 {
     let log_det = |pivots: &[f64]| pivots.iter().map(|&p| libm::log(p)).sum::<f64>();
     // the joint pivots start with those of x alone; what follows is y given x
     let pivots = joint.cholesky(COLLINEAR).pivots;
     let alone = joint.block(dx..dx + dy).cholesky(COLLINEAR).pivots;
-    0.5 * (log_det(&alone) - log_det(&pivots[dx..])) - bias(moments.n, dx, dy, given)
+    0.5 * (log_det(&alone) - log_det(&pivots[dx..])) - bias(n, dx, dy, given)
 }
 
 /// What the value is too high by, for `n` normal samples, nats.
@@ -242,6 +243,26 @@ fn local_information(samples: &Samples, x: &Scaled<'_>, y: &Scaled<'_>, total: &
         0.5 * (alone - of_both.distance(&row, &mut scratch))
     };
     samples.rows.iter().map(local).collect()
+}
+
+/// Gives a row its interval, by a jackknife over `parts` of `width` columns. Without dependence the value is χ² with
+/// `degrees` = `d_x` `d_y` degrees of freedom over 2n, whose scatter a jackknife misses.
+pub(super) fn interval(
+    out: &mut Estimate,
+    degrees: f64,
+    total: &Moments,
+    parts: &[Moments],
+    width: usize,
+    information: &dyn Fn(&Moments) -> f64,
+) {
+    let n = out.n_effective;
+    let error = jackknife(total, parts, width, information);
+    if parts.len() > 1 && error.is_finite() {
+        let seen = out.value + degrees / (2.0 * n);
+        let scatter = Scatter { seen, error, chance: libm::sqrt(degrees / 2.0) / n, n };
+        let (low, high) = scatter.around(out.value, t_quantile(parts.len()));
+        (out.interval_low, out.interval_high) = (Some(low), Some(high));
+    }
 }
 
 /// Standard error by a jackknife over the parts, error² = (G − 1)/G Σ (`θ_g` − θ̄)².

@@ -38,7 +38,7 @@
 
 use super::bounds::Objective;
 use super::contrast::{Contrast, Reading, critic};
-use super::{Build, Estimate, Estimator, Kind, MiError, Protocol, contrast_given};
+use super::{Build, Estimate, Estimator, Kind, MiError, Protocol, Training, contrast_given};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
 use crate::schema::Samples;
@@ -75,5 +75,10 @@ impl Estimator for InfoNce {
 
     fn takes_given(&self) -> bool {
         true
+    }
+
+    fn training(&self, samples: &Samples, seeds: &Seeds) -> Option<Training> {
+        // given z two critics are trained, on other samples
+        samples.z.is_none().then(|| self.0.training(samples, seeds))?
     }
 }

@@ -41,7 +41,7 @@
 use std::f64::consts::LN_2;
 
 use super::critic::{CriticTape, Separable, dot};
-use super::fit::{Fit, Model, fit, nothing_learnt, silence};
+use super::fit::{Fit, Model, Training, fit, nothing_learnt, silence, training};
 use super::prepare::{Prepared, gather, prepare, tied};
 use super::{
     Build, Estimate, Estimator, Interval, Kind, MiError, Protocol, Unit, block_interval, derangements, losses, p_value,
@@ -82,6 +82,16 @@ struct Trainee {
 }
 
 impl Trainee {
+    fn new(data: &Prepared) -> Self {
+        Self {
+            critic: Separable::deep(data.x_width, data.y_width),
+            tape: CriticTape::default(),
+            values: Vec::new(),
+            grad_positive: Vec::new(),
+            grad_negative: Vec::new(),
+        }
+    }
+
     /// Corrects the scores in the tape; returns the mean value that they then have.
     fn rescale(&mut self, scale: Scale) -> f64 {
         let CriticTape { positive, negative, .. } = &mut self.tape;
@@ -122,13 +132,7 @@ impl Model for Trainee {
 impl Estimator for Jsd {
     fn estimate(&self, samples: &Samples, protocol: &Protocol, seeds: &Seeds) -> Result<Vec<Estimate>, MiError> {
         let data = prepare(samples, seeds)?;
-        let mut model = Trainee {
-            critic: Separable::deep(data.x_width, data.y_width),
-            tape: CriticTape::default(),
-            values: Vec::new(),
-            grad_positive: Vec::new(),
-            grad_negative: Vec::new(),
-        };
+        let mut model = Trainee::new(&data);
         let diverged = || MiError::Diverged { columns: format!("{} and {}", samples.labels.x, samples.labels.y) };
         let Fit { params, steps, .. } = fit(&mut model, &data, seeds).ok_or_else(diverged)?;
         let (mut x, mut y) = (Vec::new(), Vec::new());
@@ -169,6 +173,11 @@ impl Estimator for Jsd {
             row.warnings.clone_from(&warnings);
         }
         Ok(rows)
+    }
+
+    fn training(&self, samples: &Samples, seeds: &Seeds) -> Option<Training> {
+        let data = prepare(samples, seeds).ok()?;
+        training(&mut Trainee::new(&data), "2·JSD", &data, seeds)
     }
 }
 

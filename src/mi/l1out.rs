@@ -27,8 +27,8 @@
 //!
 //! Held-out value; at most 512 others, each sample meeting the next ones in one random circle.
 
-use super::club::Fitted;
-use super::{Build, Estimate, Estimator, Kind, MiError, Protocol};
+use super::club::{Fitted, q_training};
+use super::{Build, Estimate, Estimator, Kind, MiError, Protocol, Training};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
 use crate::schema::Samples;
@@ -54,5 +54,9 @@ impl Estimator for LeaveOneOut {
         let fitted = Fitted::new(samples, seeds)?;
         let p = fitted.held.p_value(samples, &fitted.data, *protocol, seeds);
         Ok(vec![fitted.row("l1out", Kind::UpperBound, &fitted.held.leave_one_out(seeds), p)?])
+    }
+
+    fn training(&self, samples: &Samples, seeds: &Seeds) -> Option<Training> {
+        q_training(samples, seeds)
     }
 }

@@ -31,6 +31,11 @@ impl Moments {
         self.products.iter_mut().zip(&other.products).for_each(|(a, b)| *a += sign * b);
     }
 
+    /// Mean of a column.
+    pub(super) fn mean(&self, column: usize) -> f64 {
+        self.sums[column] / self.n
+    }
+
     pub(super) fn covariance(&self) -> Symmetric {
         let width = self.sums.len();
         let mut out = Symmetric { width, data: vec![0.0; width * width] };
@@ -65,6 +70,26 @@ impl Symmetric {
     pub(super) fn picked(&self, columns: &[usize]) -> Self {
         let data = columns.iter().flat_map(|&i| columns.iter().map(move |&j| self.data[i * self.width + j])).collect();
         Self { width: columns.len(), data }
+    }
+
+    /// The covariance of what the first `first` columns leave of the others. One of the first whose pivot is under `least`
+    /// times its variance is left out, since those before it explain it.
+    pub(super) fn given(&self, first: usize, least: f64) -> Self {
+        let w = self.width;
+        let mut rest = self.data.clone();
+        for k in 0..first {
+            let pivot = rest[k * w + k];
+            if pivot <= least * self.data[k * w + k] {
+                continue;
+            }
+            for i in k + 1..w {
+                let factor = rest[i * w + k] / pivot;
+                for j in k + 1..w {
+                    rest[i * w + j] -= factor * rest[k * w + j];
+                }
+            }
+        }
+        Self { width: w, data: rest }.block(first..w)
     }
 
     /// Cholesky decomposition. A column whose pivot is under `least` times its variance gets 0 and is left out of what
@@ -151,6 +176,12 @@ mod tests {
         let by_hand = (c.data[4] * a * a - 2.0 * c.data[1] * a * b + c.data[0] * b * b) / det;
         assert!((whole.distance(&[a, b, 9.0], &mut Vec::new()) - by_hand).abs() < 1e-9);
         assert_eq!(c.block(1..3).data[1], c.data[5]);
+        // what a leaves of b and of 2a − b has the same variance, and is each other's opposite
+        let left = c.given(1, 1e-9).data;
+        assert!(
+            (left[0] - pivots[1]).abs() < 1e-9 && (left[0] - left[3]).abs() < 1e-9 && (left[0] + left[1]).abs() < 1e-9
+        );
+        assert!(c.given(2, 1e-9).data[0].abs() < 1e-9);
         let mut less = moments.clone();
         let mut one = Moments::new(3);
         one.add_row(&[4.0, 5.0, 3.0]);

@@ -23,10 +23,13 @@ mod contrast_given;
 mod counts;
 pub mod critic;
 mod discrete;
+mod discrete_pass;
 mod estimate;
+mod extrapolate;
 mod fit;
 mod form;
 mod gaussian;
+mod gaussian_pass;
 mod gcmi;
 mod given;
 mod infonce;
@@ -44,6 +47,7 @@ mod negatives;
 mod neighbours;
 mod null;
 mod nwj;
+mod one_pass;
 mod part;
 mod prepare;
 mod run;
@@ -58,13 +62,16 @@ mod unseen;
 pub use calibrate::{Calibrated, Drawn, Source, calibrate, calibrated};
 pub use checks::{Check, NORMALS, SERIES};
 pub use estimate::{Estimate, Kind, Unit};
+pub use extrapolate::{DIVISIONS, Extrapolated, PartValue, extrapolated, part_value};
+pub use fit::Training;
 pub use form::{Row, holds, to_csv, to_json, to_parquet};
 pub use interval::{Interval, block_interval};
 pub use jsd::certified;
 pub use negatives::{all_others, derangements};
 pub use neighbours::ksg1_value;
 pub use null::{p_value, permuted_rows};
-pub use run::{Job, JobResult, Named, Plan, in_order, run, run_each};
+pub use one_pass::OnePass;
+pub use run::{Job, JobResult, Named, Plan, fits, in_order, job_seeds, run, run_each};
 pub use tasks::{TASKS, Task};
 
 use crate::registry::{Entry, RegistryError, Spec};
@@ -93,7 +100,7 @@ pub const ESTIMATORS: &[Entry<Build>] = &[
 ];
 
 /// What an entry of `warnings` begins with that explains and does not warn.
-pub const NOTE: &str = "note: ";
+pub const NOTE: &str = crate::schema::NOTE;
 
 /// Makes an estimator from its parameters.
 pub type Build = fn(&Spec) -> Result<Box<dyn Estimator>, RegistryError>;
@@ -105,6 +112,17 @@ pub trait Estimator: Send + Sync {
     /// # Errors
     /// [`MiError`] when the samples cannot carry the estimate.
     fn estimate(&self, samples: &Samples, protocol: &Protocol, seeds: &Seeds) -> Result<Vec<Estimate>, MiError>;
+
+    /// The training behind [`Self::estimate`] with the same seeds, looked at, where there is one and the samples can
+    /// carry it.
+    fn training(&self, _samples: &Samples, _seeds: &Seeds) -> Option<Training> {
+        None
+    }
+
+    /// The same estimate in one pass over samples that stand each for itself, where the estimator can do that.
+    fn one_pass(&self) -> Option<Box<dyn OnePass>> {
+        None
+    }
 
     /// Whether it knows what to do with columns of words.
     fn takes_words(&self) -> bool {
@@ -171,6 +189,17 @@ pub enum MiError {
     Words {
         /// Which columns.
         columns: String,
+    },
+    /// Too many categories to count.
+    #[error(
+        "more than {limit} different pairs of categories in the first {rows} rows: such columns are not discrete; take \
+         gaussian, or give --sample N"
+    )]
+    TooManyCategories {
+        /// Most pairs.
+        limit: usize,
+        /// Rows looked at.
+        rows: usize,
     },
     /// z, and an estimator that has no use for it.
     #[error("it estimates nothing given z: leave out --given, or take one of {}", taking(|e| e.takes_given()))]

@@ -48,13 +48,13 @@ pub fn run(samples: &[Samples], plan: &Plan, done: &(dyn Fn() + Sync)) -> Vec<Jo
         results.lock().unwrap_or_else(std::sync::PoisonError::into_inner).push((place, result));
         done();
     });
-    in_order(results.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner), plan)
+    let results = results.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
+    in_order(results, plan.estimators.len())
 }
 
 /// As [`run()`], but hands out each result, with its place among all, as soon as it is there; once `stop` is raised, no
 /// job is started.
 pub fn run_each(samples: &[Samples], plan: &Plan, stop: &AtomicBool, tell: &(dyn Fn(usize, JobResult) + Sync)) {
-    let seeds = Seeds::new(plan.seed).child("estimate-mi");
     let jobs: Vec<(&Samples, &Named)> =
         samples.iter().flat_map(|s| plan.estimators.iter().map(move |e| (s, e))).collect();
     jobs.par_iter().enumerate().for_each(|(place, &(samples, (name, estimator)))| {
@@ -62,15 +62,16 @@ pub fn run_each(samples: &[Samples], plan: &Plan, stop: &AtomicBool, tell: &(dyn
             return;
         }
         let labels = samples.labels.clone();
-        let seeds = job_seeds(&seeds, &labels, name);
+        let seeds = job_seeds(plan.seed, &labels, name);
         let rows = fits(samples, &**estimator).and_then(|()| estimator.estimate(samples, &plan.protocol, &seeds));
         tell(place, JobResult { job: Job { estimator: name.clone(), labels }, rows });
     });
 }
 
 /// Results by their places among all jobs, rows of the same samples compared with each other; some may be missing.
-pub fn in_order(mut results: Vec<(usize, JobResult)>, plan: &Plan) -> Vec<JobResult> {
-    let per_samples = plan.estimators.len().max(1);
+/// `estimators` is the number of them that run on the same samples.
+pub fn in_order(mut results: Vec<(usize, JobResult)>, estimators: usize) -> Vec<JobResult> {
+    let per_samples = estimators.max(1);
     results.sort_by_key(|(place, _)| *place);
     for same_samples in results.chunk_by_mut(|a, b| a.0 / per_samples == b.0 / per_samples) {
         compare(same_samples);
@@ -78,13 +79,17 @@ pub fn in_order(mut results: Vec<(usize, JobResult)>, plan: &Plan) -> Vec<JobRes
     results.into_iter().map(|(_, result)| result).collect()
 }
 
-/// What a job draws from, below the node of the command.
-fn job_seeds(command: &Seeds, labels: &SampleLabels, estimator: &str) -> Seeds {
+/// What a job draws from.
+pub fn job_seeds(seed: u64, labels: &SampleLabels, estimator: &str) -> Seeds {
+    let command = Seeds::new(seed).child("estimate-mi");
     command.child(&format!("{}/{}/{:?}", labels.x, labels.y, labels.delivered)).child(estimator)
 }
 
 /// Whether the estimator can take the samples at all.
-fn fits(samples: &Samples, estimator: &dyn Estimator) -> Result<(), MiError> {
+///
+/// # Errors
+/// [`MiError::Given`], [`MiError::Words`].
+pub fn fits(samples: &Samples, estimator: &dyn Estimator) -> Result<(), MiError> {
     if samples.z.is_some() && !estimator.takes_given() {
         return Err(MiError::Given);
     }
@@ -192,8 +197,7 @@ pub(super) mod tests {
         let other = upper.clone();
         let mut lower = Estimate::new("jsd-nwj", &labels, 0.5, Unit::Nats, Kind::LowerBound, 9);
         lower.interval_low = Some(0.4);
-        let plan = plan(&["club", "jsd"], 0, 1);
-        let results = in_order(vec![(3, job(lower)), (0, job(other)), (2, job(upper))], &plan);
+        let results = in_order(vec![(3, job(lower)), (0, job(other)), (2, job(upper))], 2);
         assert_eq!(results[0].rows.as_ref().unwrap()[0].warnings, [""; 0], "other samples");
         let warnings = &results[1].rows.as_ref().unwrap()[0].warnings;
         assert_eq!(*warnings, ["below the lower bound jsd-nwj (0.400): q fits badly, this is no upper bound"]);
@@ -211,7 +215,7 @@ pub(super) mod tests {
                 stop.store(told.lock().unwrap().len() == 3, Ordering::SeqCst);
             });
         });
-        let told = in_order(told.into_inner().unwrap(), &plan);
+        let told = in_order(told.into_inner().unwrap(), 1);
         assert_eq!(told.len(), 3);
         let whole = run(&sets, &plan, &|| ());
         let value = |r: &JobResult| r.rows.as_ref().unwrap()[0].value;

@@ -35,7 +35,7 @@
 
 use super::bounds::Objective;
 use super::contrast::{Contrast, Reading, critic};
-use super::{Build, Estimate, Estimator, Kind, MiError, Protocol};
+use super::{Build, Estimate, Estimator, Kind, MiError, Protocol, Training};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
 use crate::schema::Samples;
@@ -67,5 +67,9 @@ fn build(spec: &Spec) -> Result<Box<dyn Estimator>, RegistryError> {
 impl Estimator for Smile {
     fn estimate(&self, samples: &Samples, protocol: &Protocol, seeds: &Seeds) -> Result<Vec<Estimate>, MiError> {
         Ok(vec![self.0.row(samples, *protocol, seeds)?])
+    }
+
+    fn training(&self, samples: &Samples, seeds: &Seeds) -> Option<Training> {
+        self.0.training(samples, seeds)
     }
 }

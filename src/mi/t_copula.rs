@@ -41,9 +41,9 @@ use rayon::prelude::*;
 
 use super::bounds::infonce;
 use super::gcmi::normal_scores;
-use super::interval::{block_interval, t_quantile};
+use super::interval::{Scatter, block_interval, t_quantile};
 use super::linear::Symmetric;
-use super::part::Part;
+use super::part::{Part, Subsampled};
 use super::prepare::{scales, tied};
 use super::student::{COLLINEAR, Copula, Tail, Widths, correlation, doubled_ranks, identity};
 use super::{Build, Estimate, Estimator, MiError, NOTE, Protocol, gaussian, p_value};
@@ -226,17 +226,19 @@ impl Ranked {
         let (rows, widths) = (&samples.rows, self.widths);
         let bias = gaussian::bias(rows.len() as f64, widths.x, widths.y, widths.z);
         let copula = self.copula(&fit.tail, &fit.correlation);
-        row.value = copula.information() - bias;
+        let seen = copula.information();
+        row.value = seen - bias;
         let local = copula.local(&self.quantiles(&fit.tail, rows, rows));
         let blocks = samples.episodes();
         row.n_effective = block_interval(&local, &blocks).n_effective;
         row.warnings.push(format!("{NOTE}{:.1} degrees of freedom", fit.tail.degrees));
         (row.interval_low, row.interval_high) = (None, None);
-        if let Some((error, degrees)) = self.error(fit, samples, seeds) {
+        if let Some(of) = self.error(fit, samples, seeds) {
             // without dependence some scatter remains, as for gaussian
-            let remains = libm::sqrt((widths.x * widths.y) as f64 / 2.0) / row.n_effective;
-            let half = libm::hypot(error, remains) * t_quantile(degrees + 1);
-            (row.interval_low, row.interval_high) = (Some(row.value - half), Some(row.value + half));
+            let chance = libm::sqrt((widths.x * widths.y) as f64 / 2.0) / row.n_effective;
+            let scatter = Scatter { seen, error: of.error, chance, n: row.n_effective };
+            let (low, high) = scatter.around(row.value, t_quantile(of.degrees + 1));
+            (row.interval_low, row.interval_high) = (Some(low), Some(high));
         }
         if samples.z.is_none() {
             row.warnings.extend(self.misfit(fit, samples, row.value, seeds));
@@ -248,7 +250,7 @@ impl Ranked {
     }
 
     /// Standard error and its degrees of freedom, by subsamples that are fitted around `fit`.
-    fn error(&self, fit: &Fit, samples: &Samples, seeds: &Seeds) -> Option<(f64, usize)> {
+    fn error(&self, fit: &Fit, samples: &Samples, seeds: &Seeds) -> Option<Subsampled> {
         // ranks are estimates too: a subsample has its own
         let information = |rows: &[u32]| {
             let part = self.of_part(rows);

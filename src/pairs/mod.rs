@@ -1,165 +1,17 @@
 //! Samples from stores and tables.
 //!
 //! [`links`] reads a store: one set of samples per ordered link and class, delivered and lost apart. [`table()`] reads
-//! anybody's CSV, TSV or Parquet file: one set from named columns, or [`all_pairs`] of them. [`lagged`] moves y in time.
+//! anybody's table, in any form of [`crate::storage::TableForm`]: one set from named columns, or [`all_pairs`] of them.
+//! [`pass`] goes once over a table that memory does not hold. [`lagged`] moves y in time. [`Known`] writes a table whose information is known.
 
+mod error;
+mod known;
 mod lag;
 mod store;
 mod table;
 
-use std::path::PathBuf;
-
+pub use error::PairsError;
+pub use known::{Known, is_known};
 pub use lag::lagged;
 pub use store::links;
-pub use table::{TableOptions, all_pairs, is_store, table};
-
-use crate::io::IoError;
-use crate::storage::StorageError;
-
-/// Why there are no samples. The path comes last.
-#[derive(Debug, thiserror::Error)]
-pub enum PairsError {
-    /// The store.
-    #[error(transparent)]
-    Storage(#[from] StorageError),
-    /// The file.
-    #[error(transparent)]
-    Io(#[from] IoError),
-    /// A store without links.
-    #[error(
-        "no links: expected two or more communicators that send messages and act, found {found}; record with more --agents"
-    )]
-    NoLinks {
-        /// Communicators in the store.
-        found: usize,
-    },
-    /// A store without steps.
-    #[error("no samples: the store holds {episodes} episodes and no step; record with --episodes 1 or more")]
-    NoSteps {
-        /// Episodes in the store.
-        episodes: u64,
-    },
-    /// A value in a store that no policy can have sent.
-    #[error("column {column}, episode {episode}, step {step}: expected a finite number, found {value}")]
-    StoreValue {
-        /// Column.
-        column: String,
-        /// Episode.
-        episode: u64,
-        /// Step.
-        step: usize,
-        /// What stands there.
-        value: f32,
-    },
-    /// A table without a choice of columns.
-    #[error("not a rollout store, and as a table it needs --x and --y: name columns of it: {}", .0.display())]
-    NoColumns(PathBuf),
-    /// No episode is long enough for a lag.
-    #[error(
-        "no pair {lag} rows apart: the longest episode has {longest} rows, and none of the {samples} samples has so many after it; {remedy}"
-    )]
-    NoLag {
-        /// Rows between x and y.
-        lag: usize,
-        /// Rows of the longest episode.
-        longest: usize,
-        /// Samples without a lag.
-        samples: usize,
-        /// What to do.
-        remedy: &'static str,
-    },
-    /// A pattern that is none, or that no column matches.
-    #[error("{pattern:?}: {message}: {}", path.display())]
-    Pattern {
-        /// What stands behind `regex:`.
-        pattern: String,
-        /// What is wrong, and the columns.
-        message: String,
-        /// File.
-        path: PathBuf,
-    },
-    /// Fewer than two columns to compare.
-    #[error("--all-pairs needs two columns of numbers or words, found {found}: {}", path.display())]
-    NoPairs {
-        /// Columns found.
-        found: usize,
-        /// File.
-        path: PathBuf,
-    },
-    /// More rows than an estimator can number.
-    #[error("more than {} rows: take a part of the data", u32::MAX)]
-    TooManyRows,
-    /// The table lacks a column.
-    #[error("no column {name:?}: {hint}: {}", path.display())]
-    UnknownColumn {
-        /// What was asked for.
-        name: String,
-        /// Near names, or all.
-        hint: String,
-        /// File.
-        path: PathBuf,
-    },
-    /// A column that holds no numbers.
-    #[error("column {name:?} holds {kind}, expected integers, floats or booleans; {hint}: {}", path.display())]
-    NotNumeric {
-        /// Column.
-        name: String,
-        /// Its type.
-        kind: String,
-        /// Which columns are numeric.
-        hint: String,
-        /// File.
-        path: PathBuf,
-    },
-    /// Vectors of different lengths in one column.
-    #[error("column {name:?}, row {row}: expected a vector of {expected} numbers, found {found}: {}", path.display())]
-    Ragged {
-        /// Column.
-        name: String,
-        /// 1-based row of data.
-        row: usize,
-        /// Length of the first vector.
-        expected: usize,
-        /// Length here.
-        found: usize,
-        /// File.
-        path: PathBuf,
-    },
-    /// A number whose square is infinite.
-    #[error("column {name:?}, row {row}: infinite or over 1e150; remove the row or rescale the column: {}", path.display())]
-    Infinite {
-        /// Column.
-        name: String,
-        /// 1-based row of data.
-        row: usize,
-        /// File.
-        path: PathBuf,
-    },
-    /// Nothing left to estimate from.
-    #[error("no rows: all {rows} rows have a missing value in {columns}: {}", path.display())]
-    NoRows {
-        /// Rows in the file.
-        rows: usize,
-        /// Columns asked for.
-        columns: String,
-        /// File.
-        path: PathBuf,
-    },
-    /// The file is not what its name says.
-    #[error("not a readable {form} table: {message}: {}", path.display())]
-    Unreadable {
-        /// `CSV`, `TSV` or `Parquet`.
-        form: &'static str,
-        /// What the reader said.
-        message: String,
-        /// File.
-        path: PathBuf,
-    },
-}
-
-impl PairsError {
-    /// Whether the user's words are at fault, not the data.
-    pub fn is_usage(&self) -> bool {
-        matches!(self, Self::UnknownColumn { .. } | Self::NotNumeric { .. } | Self::NoColumns(_) | Self::Pattern { .. })
-    }
-}
+pub use table::{Passed, PieceSize, Progress, Sample, TableOptions, all_pairs, is_store, pass, size, table};

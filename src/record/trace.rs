@@ -56,7 +56,7 @@ pub fn is_link_table(path: &Path) -> Result<bool, RegistryError> {
 
 /// `CSV`, `TSV` or [`PARQUET`].
 fn form(path: &Path) -> Result<&'static str, RegistryError> {
-    storage::table_form(path).map_err(|e| data(&e))
+    storage::table_form(path).map(storage::TableForm::name).map_err(|e| data(&e))
 }
 
 /// How text of this form is read: every cell as text, so that what is wrong with it can be said.

@@ -11,7 +11,7 @@ mod samples;
 pub use agents::{AgentSpec, Controller, Layout};
 pub use episode::{Episode, Matrix};
 pub use manifest::{Manifest, Part, SELF_SHA256_PLACEHOLDER, hex};
-pub use samples::{Columns, Exchange, SampleLabels, Samples};
+pub use samples::{Columns, Exchange, NOTE, SampleLabels, Samples};
 
 /// Major version of the rollout schema that this program writes and reads.
 pub const SCHEMA_VERSION: u32 = 1;

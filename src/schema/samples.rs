@@ -2,6 +2,9 @@
 
 use std::sync::Arc;
 
+/// What a note begins with that explains and does not warn.
+pub const NOTE: &str = "note: ";
+
 /// A row-major `f64` matrix with named columns.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Columns {

@@ -26,10 +26,10 @@ use tally::Tally;
 use verify::Findings;
 
 pub use convert::convert;
-pub use form::table_form;
+pub use form::{TableForm, table_form};
 pub use lock::Owner;
 pub use names::refuse_within_store;
-pub use recover::{Recovered, recover};
+pub use recover::{Recovered, left_beside, recover};
 pub use rescue::{Rescued, rescue};
 pub use rows::{Rows, Take};
 pub use verify::{Problem, Report, Watch, ranges, verify};
@@ -230,6 +230,9 @@ pub enum StorageError {
         /// Where.
         path: PathBuf,
     },
+    /// A store would replace what it is made from.
+    #[error("this is the store itself, which cannot be made from itself, not even with --force; give another name: {}", .0.display())]
+    Same(PathBuf),
     /// Nothing is damaged.
     #[error("nothing to recover: it is whole; `ccmarl verify` checks it, `ccmarl convert` copies it: {}", path.display())]
     Whole {
@@ -255,7 +258,14 @@ pub enum StorageError {
 impl StorageError {
     /// Whether the user's words are at fault, not the data or the machine.
     pub fn is_usage(&self) -> bool {
-        matches!(self, Self::Extension { .. } | Self::Slash { .. } | Self::Within { .. } | Self::Io(IoError::Exists(_)))
+        matches!(
+            self,
+            Self::Extension { .. }
+                | Self::Slash { .. }
+                | Self::Within { .. }
+                | Self::Same(_)
+                | Self::Io(IoError::Exists(_))
+        )
     }
 }
 

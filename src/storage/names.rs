@@ -35,7 +35,7 @@ pub(super) fn check_output(path: &Path, force: bool) -> Result<(), StorageError>
 /// Refuses to write a store onto the one that it is made from.
 pub(super) fn refuse_same(from: &Path, to: &Path) -> Result<(), StorageError> {
     let real = |path: &Path| path.canonicalize().ok();
-    if real(from).is_some() && real(from) == real(to) { Err(IoError::Exists(to.to_owned()).into()) } else { Ok(()) }
+    if real(from).is_some() && real(from) == real(to) { Err(StorageError::Same(to.to_owned())) } else { Ok(()) }
 }
 
 /// Refuses an output inside a store, or inside one that is being written: other readers would take it for a part, and

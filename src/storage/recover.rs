@@ -44,6 +44,12 @@ pub(super) fn unfinished(path: &Path) -> Option<(PathBuf, PathBuf)> {
     (!path.exists() && partial.exists()).then(|| (partial, path.to_owned()))
 }
 
+/// What a kill left beside the store at `path`, which is there itself: a recording with `--force` that did not finish.
+pub fn left_beside(path: &Path) -> Option<PathBuf> {
+    let partial = io::partial_path(path);
+    (path.exists() && partial.exists()).then_some(partial)
+}
+
 /// `.<name>.partial` → `<name>`.
 pub(super) fn target_of(partial: &Path) -> Option<PathBuf> {
     let name = partial.file_name()?.as_encoded_bytes();

@@ -106,6 +106,50 @@ fn list_is_sorted_complete_json() {
 }
 
 #[test]
+fn one_link_shows_its_parameters_and_one_algorithm_its_prior() {
+    let json = |kind: &str, name: &str| -> Value {
+        serde_json::from_str(&run(&["list", kind, name, "--format", "json"]).1).unwrap()
+    };
+    assert_eq!(json("link", "distance")["parameters"]["threshold"], 3.0);
+    assert_eq!(json("link", "markov")["parameters"]["level"], "medium");
+    assert!(json("link", "trace")["parameters"].as_object().unwrap().is_empty(), "it has none without a file");
+    let cc = json("algorithm", "cc-maddpg");
+    assert_eq!((&cc["parameters"]["prior"], &cc["parameters"]["shaping"]), (&"dropout:0.2".into(), &true.into()));
+    let (code, out, err) = run(&["list", "link", "dropout"]);
+    assert!(code == 0 && out.contains("parameters of dropout:0.2:") && out.contains("0.2"), "{out}{err}");
+}
+
+#[test]
+fn force_replaces_manual_pages_and_tables_of_ours_and_nothing_else() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name).to_str().unwrap().to_owned();
+    assert_eq!(run(&["generate", "man", "--out", &at("man")]).0, 0);
+    assert_eq!(run(&["generate", "man", "--out", &at("man")]).0, 2);
+    assert_eq!(run(&["generate", "man", "--out", &at("man"), "--force"]).0, 0);
+    std::fs::write(at("man/ccmarl-list.1"), "my notes").unwrap();
+    let (code, _, err) = run(&["generate", "man", "--out", &at("man"), "--force"]);
+    assert!(code == 1 && err.contains("refusing to replace what ccmarl did not make"), "{err}");
+    let table = ["generate", "table", "--rows", "1000", "--rho", "-0.5", "--out"];
+    let (code, out, err) = run(&[&table[..], &[&at("t.parquet")]].concat());
+    assert_eq!((code, out.as_str()), (0, ""), "{err}");
+    assert!(err.contains("information: x and y 0.143841 nats, a and b 0.445846 nats"), "{err}");
+    let first = std::fs::read(at("t.parquet")).unwrap();
+    assert_eq!(run(&[&table[..], &[&at("t.parquet")]].concat()).0, 2);
+    assert_eq!(run(&[&table[..], &[&at("t.parquet"), "--force"]].concat()).0, 0);
+    assert_eq!(std::fs::read(at("t.parquet")).unwrap(), first);
+    std::fs::write(at("mine.parquet"), "mine").unwrap();
+    let (code, _, err) = run(&[&table[..], &[&at("mine.parquet"), "--force"]].concat());
+    assert!(code == 1 && err.contains("refusing to replace what ccmarl did not make"), "{err}");
+    for (words, message) in [
+        (vec!["--out", "t.csv"], "--out: expected a name that ends in .parquet, found t.csv"),
+        (vec!["--out", "t.parquet", "--rho", "1"], "expected a number between -1 and 1, without the two"),
+    ] {
+        let (code, _, err) = run(&[&["generate", "table"], &words[..]].concat());
+        assert!(code == 2 && err.contains(message), "{err}");
+    }
+}
+
+#[test]
 fn list_prints_a_table_of_every_kind() {
     let (code, out, err) = run(&["list"]);
     assert_eq!((code, err.as_str()), (0, ""));

@@ -178,7 +178,6 @@ fn lags_patterns_and_all_pairs_of_any_separator() {
         (2, &["--x", "obs_a", "--y", "y", "--lag", "5..2"], "expected 3, 0,1,5 or 0..10"),
         (1, &["--x", "obs_a", "--y", "y", "--lag", "1"], "no pair 1 rows apart: the longest episode has 1 rows"),
         (1, &["--all-pairs", "--x", "y"], "--all-pairs needs two columns of numbers or words, found 1"),
-        (2, &["--x", "obs_a", "--y", "y", "--plot", "x.svg"], "--plot draws a matrix: give --all-pairs, or a store"),
         (2, &["--all-pairs", "--plot", "x.pdf"], "expected a name that ends in .svg or .png"),
     ] {
         let (found, out, err) = run(&[&[table.as_str()], args].concat());
@@ -247,11 +246,103 @@ fn a_picture_never_takes_the_results_away() {
     assert!(code == 1 && out.contains("a ; b") && err.contains("could not create the directory"), "{code}: {out}{err}");
     // one cell would stand for several lags
     for (more, message) in [
-        (&["--lag", "0,1", "--time", "t"][..], "--plot draws one lag"),
+        (&["--lag", "0,1", "--time", "t"][..], "--plot of --all-pairs draws one lag: name one pair"),
         (&["--lag", "1", "--time", "t"], "--plot of --all-pairs is for columns at the same time"),
     ] {
         let (code, out, err) = run(&[&args[..], more, &["--plot", &at("lags.svg")]].concat());
         assert!(code == 2 && out.is_empty() && err.contains(message), "{code}: {err}");
+    }
+}
+
+#[test]
+fn a_pair_and_lags_have_pictures_with_names_escaped_and_the_values_stay_the_same() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut rng = ccmarl::rng::Seeds::new(4).stream("pair");
+    let mut text = "t,<b>&a,y,word\n".to_owned();
+    for t in 0..300 {
+        let x = ccmarl::rng::normal(&mut rng);
+        writeln!(text, "{t},{x},{},{}", x + ccmarl::rng::normal(&mut rng), ["u", "<v>"][t % 2]).unwrap();
+    }
+    let table = write(dir.path(), "pair.csv", &text);
+    let at = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+    let base = [table.as_str(), "--x", "<b>&a", "--y", "y", "--time", "t", "--permutations", "9", "--format", "json"];
+    let pair = [&base[..], &["--estimator", "infonce,gaussian,club"]].concat();
+    let (_, plain, _) = run(&pair);
+    for name in ["pair.svg", "pair.png"] {
+        let (code, out, err) = run(&[&pair[..], &["--plot", &at(name)]].concat());
+        assert_eq!((code, &out), (0, &plain), "{err}");
+        assert!(err.contains("drew 300 of 300 samples and their estimates: "), "{err}");
+    }
+    let svg = std::fs::read_to_string(at("pair.svg")).unwrap();
+    assert!(svg.contains("&lt;b&gt;&amp;a") && !svg.contains("<b>"), "escaped");
+    for words in ["training of infonce", "training of club", "infonce by number of samples", "300", "75", "gaussian"] {
+        assert!(svg.contains(&format!("\n{words}\n")), "{words}");
+    }
+    let (code, _, err) =
+        run(&[&base[..], &["--lag", "0..3", "--estimator", "gaussian", "--plot", &at("lag.svg")]].concat());
+    assert!(code == 0 && err.contains("drew 1 lines over lags: "), "{err}");
+    assert!(std::fs::read_to_string(at("lag.svg")).unwrap().contains("&lt;b&gt;&amp;a ; y by lag"));
+    // what cannot take the samples is left out of the picture, as of the rows
+    let words = [table.as_str(), "--x", "word", "--y", "y", "--permutations", "0", "--estimator", "infonce,discrete"];
+    let (code, _, err) = run(&[&words[..], &["--plot", &at("word.svg")]].concat());
+    let svg = std::fs::read_to_string(at("word.svg")).unwrap();
+    assert!(code == 0 && svg.contains("discrete by number of samples") && !svg.contains("training of"), "{err}");
+    assert!(svg.contains("word (words in order, spread)"));
+}
+
+#[test]
+fn a_table_that_memory_does_not_hold_is_read_once_and_says_what_was_estimated_how() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut rng = ccmarl::rng::Seeds::new(5).stream("large");
+    let mut text = "a,b,g,w,k\n".to_owned();
+    for row in 0..3000 {
+        let a = ccmarl::rng::normal(&mut rng);
+        let b = a + ccmarl::rng::normal(&mut rng);
+        let b = if row % 10 == 0 { String::new() } else { b.to_string() };
+        writeln!(text, "{a},{b},{},{},{}", row / 100, if a > 0.0 { "up" } else { "down" }, row % 3).unwrap();
+    }
+    let table = write(dir.path(), "large.csv", &text);
+    let base = [table.as_str(), "--x", "a", "--y", "b", "--estimator", "gaussian,ksg", "--permutations", "9"];
+    let (whole, large) = (json(&base), json(&[&base[..], &["--memory", "0"]].concat()));
+    let value = |row: &Value| row["value"].as_f64().unwrap();
+    let text_of = |row: &Value| row["warnings"].to_string();
+    assert!((value(&whole[0]) - value(&large[0])).abs() < 1e-10);
+    assert_eq!((&large[0]["n"], &large[1]["n"]), (&2700.into(), &2700.into()));
+    assert!(text_of(&large[0]).contains("note: all rows in one pass"), "{large:?}");
+    assert!(text_of(&large[0]).contains("300 of 3000 rows left out: a missing value in a, b"), "{large:?}");
+    // no more rows than the sample would have: all of them
+    assert_eq!(value(&whole[1]), value(&large[1]));
+    let few = json(&[&base[..], &["--sample", "500"]].concat());
+    assert!(few.iter().all(|row| text_of(row).contains("note: estimated on 500 of 3000 rows, drawn at random")));
+    assert!(few.iter().all(|row| (400..500).contains(&row["n"].as_u64().unwrap())), "{few:?}");
+    assert_eq!(few, json(&[&base[..], &["--sample", "500", "--threads", "1"]].concat()));
+    // words are counted; given, group and all pairs
+    let counted = [&base[..1], &["--x", "w", "--y", "k", "--given", "g", "--estimator", "discrete,gaussian"]].concat();
+    let (code, out, err) = run(&[&counted[..], &["--memory", "0", "--format", "csv"]].concat());
+    assert!(code == 0 && out.contains("\ndiscrete,w,k,g,"), "{err}");
+    assert!(err.contains("warning: no gaussian for w ; k | g: w holds words, not numbers"), "{err}");
+    for more in [&["--group", "g"][..], &["--time", "k"]] {
+        let rows = json(&[&base[..], &["--memory", "0"], more].concat());
+        assert!(rows[0]["group"].as_str().unwrap() != "row" && !text_of(&rows[0]).contains("one pass"), "{rows:?}");
+    }
+    let pairs =
+        json(&[&base[..1], &["--all-pairs", "--memory", "0", "--estimator", "gcmi", "--permutations", "0"]].concat());
+    assert_eq!(pairs.len(), 6);
+    let plot = dir.path().join("large.svg").to_string_lossy().into_owned();
+    let (code, _, err) = run(&[&base[..], &["--memory", "0", "--plot", &plot]].concat());
+    assert!(code == 0 && std::fs::read_to_string(plot).unwrap().contains("2000 points"), "{err}");
+    for (code, args, message) in [
+        (
+            2,
+            &["--memory", "0", "--lag", "1"][..],
+            "--lag needs the rows in memory, and the table is larger than --memory",
+        ),
+        (2, &["--sample", "500", "--lag", "1"], "--lag needs neighbouring rows, which --sample takes apart"),
+        (2, &["--sample", "5"], "5 is not in 10.."),
+        (2, &["--memory", "0", "--given", "zz"], "no column \"zz\""),
+    ] {
+        let (found, out, err) = run(&[&base[..], args].concat());
+        assert!(found == code && out.is_empty() && err.contains(message), "{args:?}: {err}");
     }
 }
 

@@ -1,6 +1,6 @@
 //! Figures: what a reader needs is on them, and nothing else gets in.
 
-use ccmarl::figure::{Bar, Cell, Curve, Data, FIGURES, Point, Reference, svg};
+use ccmarl::figure::{Bar, Cell, Curve, Data, FIGURES, Pair, Point, Reference, Shrunk, Training, Whisker, svg};
 use ccmarl::registry::find;
 
 fn data() -> Data {
@@ -54,7 +54,27 @@ fn data() -> Data {
         reliability: shares.clone(),
         loss_by_step: shares.clone(),
         bursts: shares.clone(),
-        loss_by_distance: shares,
+        loss_by_distance: shares.clone(),
+        mi_by_lag: shares,
+        pair: Pair {
+            names: ["wind".to_owned(), "power".to_owned()],
+            points: (0..200).map(|i| (f64::from(i) * 0.01, f64::from(i * i % 173) * 0.02)).collect(),
+            estimates: vec![
+                Whisker { label: "gaussian".to_owned(), sign: "", value: 0.4133, band: Some((0.38, 0.45)) },
+                Whisker { label: "infonce".to_owned(), sign: "≥ ", value: 0.3921, band: Some((0.35, 0.43)) },
+            ],
+            shrunk: Some(Shrunk {
+                label: "gaussian".to_owned(),
+                points: vec![(200.0, 0.41), (100.0, 0.42), (100.0, 0.43), (50.0, 0.46)],
+                line: (0.39, 3.0),
+            }),
+            trainings: vec![Training {
+                label: "infonce".to_owned(),
+                score: "bound, nats".to_owned(),
+                looks: (0..20).map(|k| (f64::from(25 * k), 0.02 * f64::from(k), 0.015 * f64::from(k))).collect(),
+                chosen: 400.0,
+            }],
+        },
         bars: ["unrestricted", "mbc-light", "dbc-heavy", "none"]
             .iter()
             .flat_map(|c| [bar(c, "fc-maddpg", -139.0), bar(c, "cc-maddpg", -129.0)])
@@ -95,4 +115,28 @@ fn a_heat_map_prints_the_values_in_its_cells() {
     for words in ["delivered", "lost", "0.304", "agent_2", "sender", "receiver"] {
         assert!(text.contains(&format!("\n{words}\n")), "{words}");
     }
+}
+
+#[test]
+fn a_pair_shows_names_values_sizes_and_what_the_lines_are() {
+    let text = svg(find("figure", FIGURES, "mi-pair").unwrap(), &data()).unwrap();
+    let shown = ["wind", "power", "200 points", "≥ 0.3921", "0.4133", "∞", "50", "200", "training", "validation"];
+    for words in [&shown[..], &["gaussian by number of samples", "training of infonce", "bound, nats"]].concat() {
+        assert!(text.contains(&format!("\n{words}\n")), "{words}");
+    }
+    let mut without = data();
+    (without.pair.shrunk, without.pair.trainings) = (None, Vec::new());
+    let text = svg(find("figure", FIGURES, "mi-pair").unwrap(), &without).unwrap();
+    assert!(text.contains("viewBox=\"0 0 1600 772\"") && !text.contains("training"), "one row of panels");
+    without.pair.estimates[1].value = f64::NAN;
+    let error = svg(find("figure", FIGURES, "mi-pair").unwrap(), &without).unwrap_err().to_string();
+    assert_eq!(error, "figure mi-pair: the estimate \"infonce\" is NaN: only finite numbers can be drawn");
+}
+
+#[test]
+fn an_interval_below_zero_stays_on_the_axis() {
+    let mut data = data();
+    data.mi_by_lag[0].points[0].band = Some((-0.5, 0.3));
+    let text = svg(find("figure", FIGURES, "mi-by-lag").unwrap(), &data).unwrap();
+    assert!(text.contains("\n−0.4\n"), "{text}");
 }

@@ -31,7 +31,7 @@ fn every_error_says_what_is_wrong_what_to_do_and_where() {
         "process {} is writing it right now: wait until it has ended, or take another name: /",
         std::process::id()
     )));
-    let texts: [(String, &str); 21] = [
+    let texts: [(String, &str); 22] = [
         (
             IoError::os("open", &path())(OsError::other("no such device")).to_string(),
             "could not open: no such device: data/x",
@@ -87,6 +87,10 @@ fn every_error_says_what_is_wrong_what_to_do_and_where() {
         (
             StorageError::Within { store: "data".into(), path: path() }.to_string(),
             "the output would lie inside the store data: give a place outside of it: data/x",
+        ),
+        (
+            StorageError::Same(path()).to_string(),
+            "this is the store itself, which cannot be made from itself, not even with --force; give another name: data/x",
         ),
         (
             StorageError::Whole { path: path() }.to_string(),

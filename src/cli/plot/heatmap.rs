@@ -1,16 +1,11 @@
 //! A heat map of estimates: links of a store, or pairs of a table's columns.
 
-use super::outputs::Picture;
-use super::ui;
 use crate::figure::{Cell, Data};
 use crate::mi::Estimate;
 
-/// Draws the rows of the first estimator that has a finite value; where none has, it says so.
-pub(super) fn draw(rows: &[Estimate], target: &Picture) -> anyhow::Result<()> {
-    let Some(first) = rows.iter().find(|r| r.value.is_finite()) else {
-        ui::say(&format!("note: no finite value to draw: {}", target.path().display()));
-        return Ok(());
-    };
+/// The values of the first estimator that has a finite one, and what they are; `None` where none has.
+pub(super) fn data(rows: &[Estimate]) -> Option<(Data, String)> {
+    let first = rows.iter().find(|r| r.value.is_finite())?;
     let of_links = first.sender.is_some();
     let chosen = rows.iter().filter(|r| r.estimator == first.estimator);
     let cell = |row: &Estimate| {
@@ -48,12 +43,6 @@ pub(super) fn draw(rows: &[Estimate], target: &Picture) -> anyhow::Result<()> {
         axes: if of_links { <[String; 2]>::default() } else { ["column".to_owned(), "column".to_owned()] },
         ..Data::default()
     };
-    target.draw("mi-heatmap", &data)?;
-    ui::say(&format!(
-        "drew {} values of {}: {}",
-        rows.iter().filter(|r| r.estimator == first.estimator).count(),
-        first.estimator,
-        target.path().display()
-    ));
-    Ok(())
+    let count = rows.iter().filter(|r| r.estimator == first.estimator).count();
+    Some((data, format!("{count} values of {}", first.estimator)))
 }
