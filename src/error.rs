@@ -50,6 +50,14 @@ pub enum Error {
 }
 
 impl Error {
+    /// Lines of a file that show the fault, for below the message.
+    pub fn excerpt(&self) -> Option<&str> {
+        match self {
+            Self::Train(TrainError::Config { excerpt, .. }) => Some(excerpt),
+            _ => None,
+        }
+    }
+
     /// Whether the user's words are at fault (exit code 2), not the data or the machine (exit code 1).
     pub fn is_usage(&self) -> bool {
         let exists = |e: &IoError| matches!(e, IoError::Exists(_));

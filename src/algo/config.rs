@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 pub struct MaddpgConfig {
     /// Widths of the hidden layers of actors and critic.
     pub hidden: Vec<usize>,
-    /// Adam's learning rate for all actors.
+    /// Adam's learning rate for all actors and their encoders.
     pub actor_learning_rate: f32,
     /// Adam's learning rate for the critic.
     pub critic_learning_rate: f32,
@@ -19,12 +19,18 @@ pub struct MaddpgConfig {
     /// Transitions per update, drawn with replacement; 1024, or 512 on `simple_tag` with six learners or more.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub batch: Option<usize>,
-    /// Largest L2 norm of the critic's gradient, and of each actor's.
+    /// Largest L2 norm of the critic's gradient, of each actor's, and of each encoder's.
     pub grad_clip: f32,
     /// Weight of mean a² in the actors' loss.
     pub action_penalty: f32,
-    /// Whether messages enter the actors: "observation" (the sender's) or "off".
+    /// What a message is: "observation" (the sender's), "encoder" (what a network makes of it), or "off".
     pub messages: Messages,
+    /// Width of an encoder's message; 8 where there are encoders (the latent width of MAIC).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub message_width: Option<usize>,
+    /// Widths of an encoder's hidden layers, none for a linear one; one of 64 where there are encoders (as MAIC's).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub encoder_hidden: Option<Vec<usize>>,
     /// Whose actions are fresh in the actors' loss: "joint" or "per-agent".
     pub actor_step: ActorStep,
     /// Which link bits a minibatch sees: "kept" from the rollout, or "redrawn".
@@ -37,6 +43,8 @@ pub struct MaddpgConfig {
 pub enum Messages {
     /// The sender's observation.
     Observation,
+    /// What the sender's encoder makes of its observation; it learns through the actors that receive it.
+    Encoder,
     /// Actors have no message inputs at all.
     Off,
 }
@@ -66,6 +74,12 @@ pub enum Masks {
 impl MaddpgConfig {
     /// The paper's batch, where nothing else is said.
     pub const BATCH: usize = 1024;
+
+    /// Width of an encoder's message, where nothing else is said.
+    pub const MESSAGE_WIDTH: usize = 8;
+
+    /// Hidden layers of an encoder, where nothing else is said.
+    pub const ENCODER_HIDDEN: [usize; 1] = [64];
 }
 
 impl Default for MaddpgConfig {
@@ -80,6 +94,8 @@ impl Default for MaddpgConfig {
             grad_clip: 0.5,
             action_penalty: 1e-6,
             messages: Messages::Observation,
+            message_width: None,
+            encoder_hidden: None,
             actor_step: ActorStep::Joint,
             masks: Masks::Kept,
         }

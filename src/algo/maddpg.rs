@@ -1,12 +1,17 @@
 //! MADDPG with one centralised critic and messages over unreliable links.
 //!
 //! Definition: critic Q(o^1…o^N, a^1…a^N), one for the team; actor i is π^i(o^i, {ι^{ji} m^{ji}}_{j≠i}) with m = the
-//! sender's observation. Per update, on one minibatch of B transitions:
+//! sender's observation, or `m^j = f_j(o^j)` of its encoder. Per update, on one minibatch of B transitions:
 //!
 //! 1. y = r̃ + γ Q⁻(o', π⁻(o', M')), no mask at the time limit; r̃ = r + bonus (the Du-MIE's, if any);
 //! 2. critic: one Adam step on mean (Q(o, a) − y)², gradient clipped at L2 norm 0.5;
 //! 3. actors: one joint Adam step on −mean Q(o, π(o, M)) + 1e−6 mean a², each actor's gradient clipped at 0.5;
 //! 4. targets: θ⁻ ← (1 − τ) θ⁻ + τ θ.
+//!
+//! Encoders are part of 3 and 4: M is computed anew from o (with the target encoders in 1), the loss of every actor that
+//! received m^j flows into `f_j`, and what was lost gives no gradient. Each encoder's gradient is clipped by itself, so
+//! that it does not shrink an actor's step; learning rate and τ are the actors'. The critic sees observations and
+//! actions alone: messages are functions of those.
 //!
 //! Source: Lowe et al. 2017; the joint step and the constants are those of the paper's parent code (one critic, one
 //! actor loss). Lowe's own step, actor i's action alone from its policy and the others' from replay, is
@@ -16,32 +21,12 @@
 //! The batch goes through in tiles of 128 rows, each through every network before the next, so that activations stay
 //! in the second-level cache.
 
-use super::config::{ActorStep, MaddpgConfig, Messages};
-use super::{Actors, Team, TeamScratch};
-use crate::nn::{Activation, Adam, AdamConfig, Input, Mlp, NnError, Packed, Params, Passes, TILE, clip_norm};
+use super::batch::{Batch, Tile, Widths};
+use super::config::{ActorStep, MaddpgConfig};
+use super::{Actors, EncoderScratch, Sight, Team, TeamScratch};
+use crate::nn::{Activation, Adam, AdamConfig, Mlp, NnError, Packed, Params, Passes, TILE, clip_norm};
 use crate::rng::Seeds;
 use crate::schema::AgentSpec;
-
-/// A minibatch of B transitions; O and A are all learners' observation and action widths together.
-#[derive(Clone, Debug, Default)]
-pub struct Batch {
-    /// B.
-    pub rows: usize,
-    /// `[B, O]`.
-    pub observations: Vec<f32>,
-    /// `[B, O]`.
-    pub next_observations: Vec<f32>,
-    /// `[B, A]`.
-    pub actions: Vec<f32>,
-    /// `[B, N, N]`, sender by receiver.
-    pub link: Vec<bool>,
-    /// `[B, N, N]`.
-    pub next_link: Vec<bool>,
-    /// Raw team reward `[B]`.
-    pub reward: Vec<f32>,
-    /// Shaping bonus stored at rollout `[B]`; zeros when shaping is computed on the minibatch or off.
-    pub bonus: Vec<f32>,
-}
 
 /// What one update reports.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -56,6 +41,8 @@ pub struct UpdateMetrics {
     pub critic_grad_norm: f64,
     /// Largest L2 norm of an actor's gradient before clipping.
     pub actor_grad_norm: f64,
+    /// Largest L2 norm of an encoder's gradient before clipping; `None` without encoders.
+    pub encoder_grad_norm: Option<f64>,
 }
 
 impl UpdateMetrics {
@@ -63,6 +50,7 @@ impl UpdateMetrics {
     pub fn is_finite(&self) -> bool {
         [self.td_loss, self.actor_objective, self.q_mean, self.critic_grad_norm, self.actor_grad_norm]
             .iter()
+            .chain(&self.encoder_grad_norm)
             .all(|v| v.is_finite())
     }
 }
@@ -72,13 +60,13 @@ impl UpdateMetrics {
 pub struct Maddpg {
     /// Constants.
     pub config: MaddpgConfig,
-    /// Shapes of the actors.
+    /// Shapes of the actors and their encoders.
     pub actors: Actors,
     /// Shape of the critic.
     pub critic: Mlp,
     /// Online and target parameters.
     pub params: Networks,
-    /// Optimiser of all actors together.
+    /// Optimiser of all actors and encoders together.
     pub actor_adam: Adam,
     /// Optimiser of the critic.
     pub critic_adam: Adam,
@@ -88,11 +76,11 @@ pub struct Maddpg {
 /// Parameters of a learner.
 #[derive(Debug)]
 pub struct Networks {
-    /// All actors, flat.
+    /// All actors, then their encoders, flat.
     pub actors: Params,
     /// The critic.
     pub critic: Params,
-    /// Target of the actors.
+    /// Target of the actors and encoders.
     pub target_actors: Params,
     /// Target of the critic.
     pub target_critic: Params,
@@ -104,6 +92,8 @@ struct Scratch {
     team: Team,
     target_team: Team,
     acting: TeamScratch,
+    sending: EncoderScratch,
+    messages: Vec<f32>,
     critic: Packed,
     target_critic: Packed,
     critic_packed_grads: Packed,
@@ -128,7 +118,7 @@ impl Maddpg {
         config: MaddpgConfig,
         seeds: &Seeds,
     ) -> Result<Self, NnError> {
-        let actors = Actors::new(learners, &config.hidden, output, config.messages == Messages::Observation);
+        let actors = Actors::new(learners, output, &config);
         let joint: usize = learners.iter().map(|a| a.observation + a.action).sum();
         let widths: Vec<usize> = [joint].into_iter().chain(config.hidden.iter().copied()).chain([1]).collect();
         let critic = Mlp::new(&widths, Activation::Relu, Activation::Identity);
@@ -167,7 +157,7 @@ impl Maddpg {
         follow(&mut self.critic_adam, &self.params.critic, &self.params.target_critic, grads, self.config.tau)?;
 
         // 3. actors, through the critic just updated, and 4. their targets
-        let (actor_objective, actor_grad_norm) = self.actor_pass(batch);
+        let (actor_objective, [actor_grad_norm, encoder_grad_norm]) = self.actor_pass(batch);
         let grads = &self.scratch.actor_grads;
         follow(&mut self.actor_adam, &self.params.actors, &self.params.target_actors, grads, self.config.tau)?;
         Ok(UpdateMetrics {
@@ -176,7 +166,21 @@ impl Maddpg {
             q_mean,
             critic_grad_norm: f64::from(critic_grad_norm),
             actor_grad_norm: f64::from(actor_grad_norm),
+            encoder_grad_norm: self.actors.encodes().then_some(f64::from(encoder_grad_norm)),
         })
+    }
+
+    /// What the encoders of now send for `rows` rows of `observations` `[rows, O]`, into `messages` `[rows, M]`; nothing
+    /// where a message is the observation.
+    pub fn encode(&mut self, observations: &[f32], rows: usize, messages: &mut Vec<f32>) {
+        let Scratch { team, sending, .. } = &mut self.scratch;
+        team.load_encoders(&self.actors, &self.params.actors.read());
+        team.encode(&self.actors, (observations, rows), sending, messages);
+    }
+
+    /// Fills in a minibatch's messages as the encoders of now would send them.
+    pub fn encode_batch(&mut self, batch: &mut Batch) {
+        self.encode(&batch.observations, batch.rows, &mut batch.messages);
     }
 
     /// The mean squared TD error that [`Maddpg::update`] would report for this minibatch and no bonus; learns nothing.
@@ -192,6 +196,8 @@ impl Maddpg {
             joint,
             target_team,
             acting,
+            sending,
+            messages,
             passes,
             grad_q,
             target,
@@ -212,7 +218,9 @@ impl Maddpg {
             // y = r + bonus + γ Q⁻(o', π⁻(o', M'))
             joint.resize(rows * widths.joint(), 0.0);
             widths.put(joint, tile.next_observations, 0);
-            target_team.act(actors, tile.next_observations, tile.next_link, rows, acting);
+            target_team.encode(actors, (tile.next_observations, rows), sending, messages);
+            let sight = Sight { observations: tile.next_observations, messages, link: tile.next_link };
+            target_team.act(actors, sight, rows, acting);
             (0..actors.len()).for_each(|i| widths.put(joint, acting.actions(i), widths.action(actors, i).start));
             let q = critic.forward_packed(target_packed, widths.input(joint), rows, passes);
             target.clear();
@@ -237,12 +245,24 @@ impl Maddpg {
         [squares / batch.rows as f64, values / batch.rows as f64]
     }
 
-    /// Mean Q(o, π(o, M)) and the largest gradient norm of an actor; clipped gradients in `scratch.actor_grads`.
-    fn actor_pass(&mut self, batch: &Batch) -> (f64, f32) {
+    /// Mean Q(o, π(o, M)) and the largest gradient norms of an actor and of an encoder; clipped gradients in
+    /// `scratch.actor_grads`.
+    fn actor_pass(&mut self, batch: &Batch) -> (f64, [f32; 2]) {
         let widths = Widths::of(&self.actors);
         let (actors, critic) = (&self.actors, &self.critic);
         let Scratch {
-            joint, team, acting, passes, grad_q, grad_joint, grad_action, actor_grads, critic: packed, ..
+            joint,
+            team,
+            acting,
+            sending,
+            messages,
+            passes,
+            grad_q,
+            grad_joint,
+            grad_action,
+            actor_grads,
+            critic: packed,
+            ..
         } = &mut self.scratch;
         team.load(actors, &self.params.actors.read());
         team.clear_grads(actors);
@@ -257,7 +277,10 @@ impl Maddpg {
         for start in (0..batch.rows).step_by(TILE) {
             let rows = TILE.min(batch.rows - start);
             let tile = Tile::of(batch, start, rows, widths, n);
-            team.act(actors, tile.observations, tile.link, rows, acting);
+            team.encode(actors, (tile.observations, rows), sending, messages);
+            sending.clear_grads(actors, rows);
+            let sight = Sight { observations: tile.observations, messages, link: tile.link };
+            team.act(actors, sight, rows, acting);
             joint.resize(rows * widths.joint(), 0.0);
             widths.put(joint, tile.observations, 0);
             grad_q.clear();
@@ -285,18 +308,24 @@ impl Maddpg {
                     for (grad, a) in own {
                         grad_action.extend(grad[from..from + width].iter().zip(a).map(|(g, a)| g + penalty * a));
                     }
-                    team.backward(actors, i, (tile.observations, rows), grad_action, acting);
+                    team.backward(actors, i, (sight, rows), grad_action, (acting, sending));
                 }
             }
+            team.backward_encoders(actors, (tile.observations, rows), sending);
         }
         actor_grads.resize(actors.parameters(), 0.0);
-        let mut norm = 0.0f32;
+        let mut norms = [0.0f32; 2];
         for i in 0..n {
-            let grads = &mut actor_grads[actors.offsets[i]..actors.offsets[i + 1]];
+            let grads = &mut actor_grads[actors.range(i)];
             team.grads(actors, i, grads);
-            norm = norm.max(clip_norm(grads, self.config.grad_clip));
+            norms[0] = norms[0].max(clip_norm(grads, self.config.grad_clip));
         }
-        (objective / (batch.rows * passes_needed) as f64, norm)
+        for j in 0..actors.encoders.len() {
+            let grads = &mut actor_grads[actors.encoder_range(j)];
+            team.encoder_grads(actors, j, grads);
+            norms[1] = norms[1].max(clip_norm(grads, self.config.grad_clip));
+        }
+        (objective / (batch.rows * passes_needed) as f64, norms)
     }
 }
 
@@ -307,101 +336,36 @@ fn follow(adam: &mut Adam, online: &Params, target: &Params, grads: &[f32], tau:
     moved
 }
 
-/// Consecutive rows of a batch.
-struct Tile<'a> {
-    observations: &'a [f32],
-    next_observations: &'a [f32],
-    actions: &'a [f32],
-    link: &'a [bool],
-    next_link: &'a [bool],
-    reward: &'a [f32],
-}
-
-impl<'a> Tile<'a> {
-    fn of(batch: &'a Batch, start: usize, rows: usize, widths: Widths, learners: usize) -> Self {
-        let [o, a, l] =
-            [widths.observations, widths.actions, learners * learners].map(|w| start * w..(start + rows) * w);
-        Self {
-            observations: &batch.observations[o.clone()],
-            next_observations: &batch.next_observations[o],
-            actions: &batch.actions[a],
-            link: &batch.link[l.clone()],
-            next_link: &batch.next_link[l],
-            reward: &batch.reward[start..start + rows],
-        }
-    }
-}
-
-/// Widths of the critic's input: all observations, then all actions.
-#[derive(Clone, Copy)]
-struct Widths {
-    observations: usize,
-    actions: usize,
-}
-
-impl Widths {
-    fn of(actors: &Actors) -> Self {
-        Self { observations: actors.observation.iter().sum(), actions: actors.networks.iter().map(Mlp::outputs).sum() }
-    }
-
-    fn joint(self) -> usize {
-        self.observations + self.actions
-    }
-
-    /// Columns of actor `i`'s action in the critic's input.
-    fn action(self, actors: &Actors, i: usize) -> std::ops::Range<usize> {
-        let start = self.observations + actors.networks[..i].iter().map(Mlp::outputs).sum::<usize>();
-        start..start + actors.networks[i].outputs()
-    }
-
-    /// Lays rows into the critic's input rows, from column `at`.
-    fn put(self, joint: &mut [f32], rows: &[f32], at: usize) {
-        let width = rows.len() * self.joint() / joint.len();
-        for (to, from) in joint.chunks_exact_mut(self.joint()).zip(rows.chunks_exact(width)) {
-            to[at..at + width].copy_from_slice(from);
-        }
-    }
-
-    fn input(self, joint: &[f32]) -> Input<'_> {
-        Input { data: joint, stride: self.joint() }
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use candle_core::{Device, Tensor, Var};
+
     use super::*;
+    use crate::algo::{Messages, agent};
     use crate::rng;
-    use crate::schema::Controller;
 
     fn agents(n: usize) -> Vec<AgentSpec> {
-        (0..n)
-            .map(|i| AgentSpec {
-                name: format!("agent_{i}"),
-                team: "team".to_owned(),
-                controller: Controller::Policy,
-                learner: true,
-                communicator: true,
-                observation: 3 + i,
-                message: 3 + i,
-                action: 2,
-            })
-            .collect()
+        (0..n).map(|i| agent(&format!("agent_{i}"), 3 + i, 2)).collect()
     }
 
-    fn batch(rows: usize) -> Batch {
+    /// Transitions of `n` of these agents.
+    fn batch(rows: usize, n: usize) -> Batch {
         let mut rng = Seeds::new(9).stream("batch");
         let mut draw = |n: usize| (0..n).map(|_| rng::uniform(&mut rng, -1.0, 1.0) as f32).collect::<Vec<_>>();
         let mut rng2 = Seeds::new(9).stream("bits");
-        let mut bits = || (0..rows * 4).map(|i| i % 4 % 3 == 0 || rng::bernoulli(&mut rng2, 0.5)).collect::<Vec<_>>();
+        let links = n * n;
+        let mut bit = |i: usize| (i % links).is_multiple_of(n + 1) || rng::bernoulli(&mut rng2, 0.5);
+        let mut bits = || (0..rows * links).map(&mut bit).collect::<Vec<_>>();
+        let observed: usize = agents(n).iter().map(|a| a.observation).sum();
         Batch {
             rows,
-            observations: draw(rows * 7),
-            next_observations: draw(rows * 7),
-            actions: draw(rows * 4),
+            observations: draw(rows * observed),
+            next_observations: draw(rows * observed),
+            actions: draw(rows * 2 * n),
             link: bits(),
             next_link: bits(),
             reward: draw(rows),
-            bonus: Vec::new(),
+            ..Batch::default()
         }
     }
 
@@ -411,7 +375,7 @@ mod tests {
         let config = MaddpgConfig { actor_learning_rate: 1e-3, tau: 0.0, ..MaddpgConfig::default() };
         let mut learner =
             Maddpg::new(&agents.iter().collect::<Vec<_>>(), Activation::Tanh, config, &Seeds::new(1)).unwrap();
-        let batch = batch(256);
+        let batch = batch(256, 2);
         let before = learner.td_loss(&batch);
         let first = learner.update(&batch, &[]).unwrap();
         assert!((first.td_loss - before).abs() < 1e-9);
@@ -427,7 +391,7 @@ mod tests {
     fn a_constant_bonus_raises_the_target_by_itself() {
         let agents = agents(2);
         let agents: Vec<&AgentSpec> = agents.iter().collect();
-        let batch = batch(64);
+        let batch = batch(64, 2);
         let mut plain = Maddpg::new(&agents, Activation::Tanh, MaddpgConfig::default(), &Seeds::new(1)).unwrap();
         let mut shaped = Maddpg::new(&agents, Activation::Tanh, MaddpgConfig::default(), &Seeds::new(1)).unwrap();
         let richer = Batch { reward: batch.reward.iter().map(|r| r + 3.0).collect(), ..batch.clone() };
@@ -439,17 +403,23 @@ mod tests {
     /// What the actors climb, from the definition and one network at a time: mean Q with the actions of `fresh` actors
     /// from their policies and the others' from the batch.
     fn objective(learner: &Maddpg, batch: &Batch, fresh: &[usize]) -> f64 {
-        let (mut joint, mut input) = (Vec::new(), Vec::new());
+        let (mut joint, mut input, mut sent) = (Vec::new(), Vec::new(), Vec::new());
         let mut tape = crate::nn::Tape::default();
+        let (actors, params) = (&learner.actors, learner.params.actors.read());
         for row in 0..batch.rows {
             let observations = &batch.observations[row * 7..(row + 1) * 7];
             joint.extend_from_slice(observations);
+            sent.clear();
+            for (j, encoder) in actors.encoders.iter().enumerate() {
+                let seen = &observations[actors.observation_offset(j)..];
+                sent.extend_from_slice(encoder.forward(&params[actors.encoder_range(j)], seen, 1, &mut tape));
+            }
+            let messages = if actors.encodes() { &sent[..] } else { observations };
             for i in 0..2 {
                 if fresh.contains(&i) {
                     input.clear();
-                    learner.actors.push_input(i, observations, &batch.link[row * 4..], &mut input);
-                    let params = learner.params.actors.read();
-                    joint.extend_from_slice(learner.actors.act(&params, i, &input, 1, &mut tape));
+                    actors.push_input(i, observations, messages, &batch.link[row * 4..], &mut input);
+                    joint.extend_from_slice(actors.act(&params, i, &input, 1, &mut tape));
                 } else {
                     joint.extend_from_slice(&batch.actions[row * 4 + 2 * i..row * 4 + 2 * i + 2]);
                 }
@@ -463,10 +433,20 @@ mod tests {
     fn actor_gradients_equal_finite_differences_jointly_and_one_by_one() {
         let agents = agents(2);
         let agents: Vec<&AgentSpec> = agents.iter().collect();
-        let batch = batch(150);
-        for actor_step in [ActorStep::Joint, ActorStep::PerAgent] {
-            let config =
-                MaddpgConfig { grad_clip: f32::INFINITY, action_penalty: 0.0, actor_step, ..MaddpgConfig::default() };
+        let batch = batch(150, 2);
+        for (actor_step, messages) in [
+            (ActorStep::Joint, Messages::Observation),
+            (ActorStep::PerAgent, Messages::Observation),
+            (ActorStep::Joint, Messages::Encoder),
+            (ActorStep::PerAgent, Messages::Encoder),
+        ] {
+            let config = MaddpgConfig {
+                grad_clip: f32::INFINITY,
+                action_penalty: 0.0,
+                actor_step,
+                messages,
+                ..MaddpgConfig::default()
+            };
             let mut learner = Maddpg::new(&agents, Activation::Sigmoid, config, &Seeds::new(4)).unwrap();
             learner.td_pass(&batch, &[], false);
             let (found, _) = learner.actor_pass(&batch);
@@ -475,10 +455,20 @@ mod tests {
             assert!((found - mean).abs() < 1e-6, "{found} and {mean}");
             let start = learner.params.actors.read().to_vec();
             let grads = learner.scratch.actor_grads.clone();
-            // both actors' first weights and last biases, a weight of a received message, and the steepest coordinate
-            let steepest = (0..grads.len()).max_by(|&a, &b| grads[a].abs().total_cmp(&grads[b].abs())).unwrap();
-            let second = learner.actors.offsets[1];
-            for at in [0, 5, second, second - 1, second + 6, grads.len() - 1, steepest] {
+            let steepest = |range: std::ops::Range<usize>| {
+                range.max_by(|&a, &b| grads[a].abs().total_cmp(&grads[b].abs())).unwrap()
+            };
+            // each with whose objective it moves: both actors' first weights and last biases, a weight of a received
+            // message, the steepest coordinate; an encoder moves what its receiver does
+            let actors = &learner.actors;
+            let [first, second] = [0, 1].map(|i| actors.range(i));
+            let mut places: Vec<_> = [0, 5, second.start - 1, steepest(first)].map(|at| (at, 0)).to_vec();
+            places.extend([second.start, second.start + 6, second.end - 1, steepest(second)].map(|at| (at, 1)));
+            for j in 0..actors.encoders.len() {
+                let own = actors.encoder_range(j);
+                places.extend([own.start, own.end - 1, steepest(own)].map(|at| (at, 1 - j)));
+            }
+            for (at, moved) in places {
                 let mut values = [0.0; 2];
                 for (value, step) in values.iter_mut().zip([1e-2f32, -1e-2]) {
                     let move_one = |p: &mut [f32]| {
@@ -486,7 +476,7 @@ mod tests {
                         p[at] += step;
                     };
                     learner.params.actors.update(move_one).unwrap();
-                    *value = objective(&learner, &batch, groups[usize::from(at >= second)]);
+                    *value = objective(&learner, &batch, groups[moved]);
                 }
                 let slope = -(values[0] - values[1]) / 2e-2;
                 let error = (slope - f64::from(grads[at])).abs();
@@ -495,13 +485,151 @@ mod tests {
         }
     }
 
+    /// The gradient of the actors' loss by candle's autograd, from the definition.
+    fn by_candle(learner: &Maddpg, batch: &Batch) -> Vec<f32> {
+        let (actors, n, rows) = (&learner.actors, learner.actors.len(), batch.rows);
+        let flat = |data: &[f32]| Tensor::from_slice(data, data.len(), &Device::Cpu).unwrap();
+        let table = |data: &[f32]| flat(data).reshape((rows, data.len() / rows)).unwrap();
+        let cat = |parts: &[&Tensor]| Tensor::cat(parts, 1).unwrap();
+        let params = Var::from_tensor(&flat(&learner.params.actors.read())).unwrap();
+        let critic = flat(&learner.params.critic.read());
+        let (observations, replayed) = (table(&batch.observations), table(&batch.actions));
+        let seen = |j: usize| observations.narrow(1, actors.observation_offset(j), actors.observation[j]).unwrap();
+        let arrived = |j: usize, i: usize| {
+            let bits = batch.link.chunks_exact(n * n).map(|bits| f32::from(u8::from(bits[j * n + i])));
+            let bits = table(&bits.collect::<Vec<_>>());
+            let sent = match actors.encoders.get(j) {
+                Some(encoder) => encoder.by_candle(&params, actors.encoder_range(j).start, &seen(j)),
+                None => seen(j),
+            };
+            sent.broadcast_mul(&bits).unwrap()
+        };
+        let acted: Vec<Tensor> = (0..n)
+            .map(|i| {
+                let others = (0..n).filter(|&j| j != i && actors.messages != Messages::Off);
+                let input: Vec<Tensor> = [seen(i)].into_iter().chain(others.map(|j| arrived(j, i))).collect();
+                actors.networks[i].by_candle(&params, actors.range(i).start, &cat(&input.iter().collect::<Vec<_>>()))
+            })
+            .collect();
+        let groups: Vec<Vec<usize>> = match learner.config.actor_step {
+            ActorStep::Joint => vec![(0..n).collect()],
+            ActorStep::PerAgent => (0..n).map(|i| vec![i]).collect(),
+        };
+        let mut loss = Tensor::new(0.0f32, &Device::Cpu).unwrap();
+        for fresh in groups {
+            let others: Vec<Tensor> = (0..n).map(|i| replayed.narrow(1, 2 * i, 2).unwrap()).collect();
+            let actions = (0..n).map(|i| if fresh.contains(&i) { &acted[i] } else { &others[i] });
+            let joint: Vec<&Tensor> = [&observations].into_iter().chain(actions).collect();
+            let q = learner.critic.by_candle(&critic, 0, &cat(&joint)).mean_all().unwrap();
+            let squares = cat(&fresh.iter().map(|&i| &acted[i]).collect::<Vec<_>>()).sqr().unwrap().mean_all().unwrap();
+            let penalty = (squares * f64::from(learner.config.action_penalty)).unwrap();
+            loss = ((loss - q).unwrap() + penalty).unwrap();
+        }
+        loss.backward().unwrap().get(&params).unwrap().to_vec1().unwrap()
+    }
+
+    #[test]
+    fn gradients_of_actors_and_encoders_equal_candles_autograd() {
+        let agents = agents(3);
+        let agents: Vec<&AgentSpec> = agents.iter().collect();
+        let batch = batch(300, 3);
+        for actor_step in [ActorStep::Joint, ActorStep::PerAgent] {
+            for (messages, encoder_hidden) in [
+                (Messages::Observation, None),
+                (Messages::Off, None),
+                (Messages::Encoder, None),
+                (Messages::Encoder, Some(vec![])),
+                (Messages::Encoder, Some(vec![20, 7])),
+            ] {
+                let (grad_clip, action_penalty) = (f32::INFINITY, 0.1);
+                let base = MaddpgConfig { grad_clip, action_penalty, messages, actor_step, ..MaddpgConfig::default() };
+                let config = MaddpgConfig { encoder_hidden, ..base };
+                let mut learner = Maddpg::new(&agents, Activation::Tanh, config, &Seeds::new(4)).unwrap();
+                learner.td_pass(&batch, &[], false); // lays out the critic
+                learner.actor_pass(&batch);
+                let (found, exact) = (&learner.scratch.actor_grads, by_candle(&learner, &batch));
+                assert_eq!(found.len(), exact.len());
+                let actors = &learner.actors;
+                let all =
+                    (0..3).map(|i| actors.range(i)).chain((0..actors.encoders.len()).map(|j| actors.encoder_range(j)));
+                for range in all {
+                    let scale = exact[range.clone()].iter().fold(0.0f32, |m, g| m.max(g.abs()));
+                    assert!(scale > 1e-4, "nothing to compare: {scale}");
+                    for at in range {
+                        let error = (found[at] - exact[at]).abs();
+                        assert!(
+                            error <= 1e-5 * scale,
+                            "{at}: {} and {}, {actor_step:?}, {messages:?}",
+                            found[at],
+                            exact[at]
+                        );
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn an_encoder_learns_through_those_alone_who_receive_it() {
+        let agents = agents(3);
+        let agents: Vec<&AgentSpec> = agents.iter().collect();
+        let config = MaddpgConfig { messages: Messages::Encoder, ..MaddpgConfig::default() };
+        let mut learner = Maddpg::new(&agents, Activation::Tanh, config, &Seeds::new(4)).unwrap();
+        let mut batch = batch(150, 3);
+        let silent = |at: usize| (at % 9).is_multiple_of(4);
+        batch.link = (0..9 * 150).map(|at| silent(at) || at % 9 == 5).collect(); // of all messages, 1 → 2 alone arrives
+        learner.td_pass(&batch, &[], false);
+        let (_, [actors, encoders]) = learner.actor_pass(&batch);
+        assert!(actors > 0.0 && encoders > 0.0);
+        let moved: Vec<bool> = (0..3)
+            .map(|j| learner.scratch.actor_grads[learner.actors.encoder_range(j)].iter().any(|&g| g != 0.0))
+            .collect();
+        assert_eq!(moved, [false, true, false]);
+        batch.link = (0..9 * 150).map(silent).collect();
+        assert_eq!(learner.actor_pass(&batch).1[1], 0.0);
+        // where no message ever arrives, as for maddpg, the encoders stay as they are
+        batch.next_link.clone_from(&batch.link);
+        let before = learner.params.actors.read().to_vec();
+        let found = learner.update(&batch, &[]).unwrap();
+        assert_eq!(found.encoder_grad_norm, Some(0.0));
+        let (own, after) = (learner.actors.encoder_range(0).start, learner.params.actors.read());
+        assert!(before[own..] == after[own..] && before[..own] != after[..own]);
+    }
+
+    #[test]
+    fn an_encoders_gradient_is_clipped_by_itself_and_its_target_follows() {
+        let agents = agents(2);
+        let agents: Vec<&AgentSpec> = agents.iter().collect();
+        let batch = batch(150, 2);
+        let made = |grad_clip| {
+            let config = MaddpgConfig { messages: Messages::Encoder, grad_clip, ..MaddpgConfig::default() };
+            let mut learner = Maddpg::new(&agents, Activation::Tanh, config, &Seeds::new(4)).unwrap();
+            learner.td_pass(&batch, &[], false);
+            learner
+        };
+        let (mut free, mut bound) = (made(f32::INFINITY), made(1e-4));
+        let (_, norms) = free.actor_pass(&batch);
+        assert_eq!(bound.actor_pass(&batch).1, norms);
+        for range in [0, 1].map(|j| free.actors.encoder_range(j)) {
+            let norm =
+                |learner: &Maddpg| clip_norm(&mut learner.scratch.actor_grads[range.clone()].to_vec(), f32::INFINITY);
+            assert!(norm(&free) > 2e-4 && (norm(&bound) - 1e-4).abs() < 1e-6, "{} and {}", norm(&free), norm(&bound));
+        }
+        let start = free.params.actors.read().to_vec();
+        free.update(&batch, &[]).unwrap();
+        let (online, target) = (free.params.actors.read(), free.params.target_actors.read());
+        let moved = |at: usize| start[at] + 0.01 * (online[at] - start[at]);
+        assert!(free.actors.encoder_range(1).all(|at| (target[at] - moved(at)).abs() < 1e-7));
+        assert!(free.actors.encoder_range(1).any(|at| online[at] != start[at]));
+    }
+
     #[test]
     fn the_critics_gradient_equals_finite_differences_of_its_loss() {
         let agents = agents(2);
         let config = MaddpgConfig::default();
         let mut learner =
             Maddpg::new(&agents.iter().collect::<Vec<_>>(), Activation::Tanh, config, &Seeds::new(4)).unwrap();
-        let batch = batch(300);
+        let batch = batch(300, 2);
         learner.td_pass(&batch, &[], true);
         let mut grads = vec![0.0; learner.critic.parameters()];
         learner.critic.unpack_grads(&learner.scratch.critic_packed_grads, &mut grads);

@@ -3,17 +3,22 @@
 //! Adding a row of the paper (or a variant of it): add a preset in `presets.rs` and its line below. Adding an
 //! algorithm: write `algo/<name>.rs` top to bottom, then its presets.
 
+mod actor_file;
 mod actors;
+mod batch;
 mod config;
+mod encoders;
 mod maddpg;
 mod presets;
 mod team;
 
 pub use actors::{Actors, RunPolicyError};
+pub use batch::Batch;
 pub use config::{ActorStep, MaddpgConfig, Masks, Messages};
-pub use maddpg::{Batch, Maddpg, UpdateMetrics};
+pub use encoders::EncoderScratch;
+pub use maddpg::{Maddpg, UpdateMetrics};
 pub use presets::Preset;
-pub use team::{Team, TeamScratch};
+pub use team::{Sight, Team, TeamScratch};
 
 use crate::registry::{Entry, RegistryError};
 
@@ -33,4 +38,19 @@ pub const ALGORITHMS: &[Entry<fn() -> Preset>] = &[
 /// [`RegistryError::Unknown`] with the nearest names.
 pub fn preset(name: &str) -> Result<Preset, RegistryError> {
     Ok((crate::registry::find("algorithm", ALGORITHMS, name)?.build)())
+}
+
+/// A learner that sends what it observes, for tests.
+#[cfg(test)]
+fn agent(name: &str, observation: usize, action: usize) -> crate::schema::AgentSpec {
+    crate::schema::AgentSpec {
+        name: name.to_owned(),
+        team: "team".to_owned(),
+        controller: crate::schema::Controller::Policy,
+        learner: true,
+        communicator: true,
+        observation,
+        message: observation,
+        action,
+    }
 }

@@ -9,6 +9,7 @@ use super::args::end_on_signals;
 use super::estimates::{class, place, print, split, writer};
 use super::jobs::{Gathered, gather};
 use super::large::{self, Input};
+use super::outputs::Picture;
 use super::plot::{self, View};
 use super::{Outcome, ui};
 use crate::Error;
@@ -66,6 +67,7 @@ The rows mean:
   l1out          the tighter upper bound alone; club-sample: club with one negative
   club-fit       how much better club's density fits than the margin; near 0 it bounds nothing
   gaussian       exact for normal data, bias-corrected, nats; gcmi: the same after ranks made every column normal
+  t-copula       gcmi for columns that share a heavy tail; says when it does not fit
   ksg1, ksg2     nearest neighbours, no model, nats; ksg-mixed: for ties and discrete beside continuous columns
   discrete       exact counts of categories, nats; discrete-mm: less the bias of few samples";
 
@@ -221,7 +223,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     end_on_signals()?;
     let plan = plan(args)?;
     let write = args.out.as_deref().map(|path| writer(path, &args.paths, args.force)).transpose()?;
-    let plot = args.plot.as_deref().map(|path| Ok((view(args)?, plot::target(path, args.force)?)));
+    let plot = args.plot.as_deref().map(|path| Ok((view(args)?, Picture::at(path, args.force)?)));
     let plot = plot.transpose().map_err(|error: Error| error)?;
     let estimators = plan.estimators.len();
     let Input { samples, plan, places, results } = input(args, plan)?;
@@ -318,7 +320,8 @@ fn input(args: &Args, plan: Plan) -> anyhow::Result<Input> {
         let (paths, mut options) = (pairs::matching(&args.paths).map_err(Error::from)?, options(args)?);
         if pairs::size(&paths, &options).map_err(Error::from)? > u64::from(args.memory) << 20 {
             if args.lag.iter().any(|&lag| lag > 0) {
-                let message = "--lag needs the rows in memory, and the table is larger than --memory: take a part of it";
+                let message =
+                    "--lag needs the rows in memory, and the table is larger than --memory: take a part of it";
                 return Err(Error::Usage(format!("{message}: {}", paths[0].display())).into());
             }
             options.sample = Some(pairs::Sample { rows: large::SAMPLE, seeds: sample_seeds(args) });

@@ -3,37 +3,23 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use super::outputs::{self, Write};
 use super::ui;
 use crate::mi::{self, Estimate, Job, JobResult, Kind};
 use crate::schema::{SampleLabels, Samples};
-use crate::{Error, io, storage};
+use crate::{Error, io};
 
 /// A job that gave no rows, and why.
 pub(super) type Failure = (Job, mi::MiError);
 
-/// A form of output file.
-pub(super) type Write = fn(&[Estimate]) -> Result<Vec<u8>, String>;
-
 /// How the rows are written to a file of this name, which must not hold anything that is not ours.
-pub(super) fn writer(path: &Path, inputs: &[PathBuf], force: bool) -> anyhow::Result<Write> {
+pub(super) fn writer(path: &Path, inputs: &[PathBuf], force: bool) -> anyhow::Result<Write<Estimate>> {
     let real = |p: &Path| p.canonicalize().ok();
     if real(path).is_some() && inputs.iter().any(|input| real(path) == real(input)) {
         let message = format!("--out would replace the input: {}", path.display());
         return Err(Error::Usage(message).into());
     }
-    io::refuse_existing(path, force).map_err(Error::from)?;
-    storage::refuse_within_store(path).map_err(Error::from)?;
-    let forms: [(&str, Write); 3] = [("json", mi::to_json), ("csv", mi::to_csv), ("parquet", mi::to_parquet)];
-    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
-    let form = forms.iter().find(|(name, _)| extension.as_deref() == Some(*name));
-    let usage = || {
-        Error::Usage(format!("--out: expected a name that ends in .json, .csv or .parquet, found {}", path.display()))
-    };
-    let write = form.map(|(_, write)| *write).ok_or_else(usage)?;
-    if path.symlink_metadata().is_ok() && !mi::is_estimates(path) {
-        return Err(Error::from(io::IoError::Foreign(path.to_owned())).into());
-    }
-    Ok(write)
+    Ok(outputs::table(path, force)?)
 }
 
 /// All rows, and the jobs that gave none; an error when no job gave any.

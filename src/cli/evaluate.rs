@@ -11,8 +11,7 @@ use crate::io::IoError;
 use crate::link::suite;
 use crate::record::{ActionNoise, Trained};
 use crate::scenario;
-use crate::stats::{mean, sd};
-use crate::train::{EvaluationRow, TrainConfig, evaluate, evaluation_seed, write_evaluation};
+use crate::train::{ChannelSummary, TrainConfig, evaluate, evaluation_seed, summarise, write_evaluation};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -51,7 +50,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         return Err(Error::from(IoError::Missing(args.run.clone())).into());
     }
     // the prior is not built: the tests need none, and the trace of one may have moved
-    let (config, _) = TrainConfig::parse(&file).map_err(Error::from)?;
+    let config = TrainConfig::parse(&file).map_err(Error::from)?;
     let scenario = scenario::build(&config.scenario).map_err(Error::from)?;
     let team = Trained::load(&args.run, &*scenario, ActionNoise::None).map_err(Error::from)?;
     let trained = team.actors.steps;
@@ -68,41 +67,31 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     bar.finish_and_clear();
     write_evaluation(&args.run, &config, team.actors.len(), &rows).map_err(Error::from)?;
 
-    let mut summary = Vec::new();
-    for channel in &channels {
-        let of = |value: fn(&EvaluationRow) -> f64| -> Vec<f64> {
-            rows.iter().filter(|r| r.channel == channel.id).map(value).collect()
-        };
-        let (returns, losses) = (of(|r| r.episode_return), of(|r| r.loss_rate));
-        summary.push((channel.id, mean(&returns), sd(&returns), mean(&losses), returns.len()));
-    }
+    let channels = summarise(&rows);
     match args.format {
         ui::Format::Json => {
-            let channels: Vec<_> = summary
-                .iter()
-                .map(|(id, mean, std, loss, n)| {
-                    json!({"channel": id, "return_mean": mean, "return_std": std, "loss_rate": loss, "episodes": n})
-                })
-                .collect();
             ui::print_json(&json!({"run": args.run.display().to_string(), "algorithm": config.algorithm,
                 "scenario": config.scenario, "seed": config.seed, "channels": channels}))?;
         }
         ui::Format::Table => {
-            let rows: Vec<Vec<String>> = summary
-                .iter()
-                .map(|(id, mean, std, loss, n)| {
-                    vec![
-                        (*id).to_owned(),
-                        format!("{mean:.1}"),
-                        if *n > 1 { format!("{std:.1}") } else { "one episode".to_owned() },
-                        format!("{:.1} %", 100.0 * loss),
-                        n.to_string(),
-                    ]
-                })
-                .collect();
-            ui::print_table(&["channel", "return", "± over episodes", "messages lost", "episodes"], &rows)?;
+            print_channels(&channels)?;
             ui::say(&format!("return: {}", scenario.reward_convention()));
         }
     }
     Ok(Outcome::Done)
+}
+
+/// Prints one line per channel.
+pub(super) fn print_channels(channels: &[ChannelSummary]) -> anyhow::Result<()> {
+    let line = |c: &ChannelSummary| {
+        vec![
+            c.channel.clone(),
+            format!("{:.1}", c.return_mean),
+            if c.episodes > 1 { format!("{:.1}", c.return_std) } else { "one episode".to_owned() },
+            format!("{:.1} %", 100.0 * c.loss_rate),
+            c.episodes.to_string(),
+        ]
+    };
+    let rows: Vec<Vec<String>> = channels.iter().map(line).collect();
+    ui::print_table(&["channel", "return", "± over episodes", "messages lost", "episodes"], &rows)
 }

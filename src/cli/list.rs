@@ -8,9 +8,9 @@ use serde_json::{Map, Value, json};
 
 use super::Outcome;
 use super::ui::{self, Format};
-use crate::{algo, link};
 use crate::registry::{self, Entry, RegistryError, Spec};
 use crate::scenario;
+use crate::{algo, link};
 
 /// The profiles of every scenario.
 const PROFILES: [&str; 2] = ["paper", "mpe2"];

@@ -1,10 +1,11 @@
 //! Files that commands write beside their results: what `--force` may replace of them, and pictures that say who drew them.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use crate::Error;
+use crate::figure::{self, Data, FIGURES};
 use crate::io::{self, IoError};
-use crate::storage;
+use crate::registry::find;
+use crate::{Error, mi, storage};
 
 /// What our SVG pictures end with.
 const SVG_MARK: &str = "<!-- ccmarl -->\n";
@@ -35,6 +36,64 @@ pub(super) fn is_picture(bytes: &[u8]) -> bool {
     png || bytes.starts_with(b"<svg") && bytes.ends_with(SVG_MARK.as_bytes())
 }
 
+/// A form of output file.
+pub(super) type Write<R> = fn(&[R]) -> Result<Vec<u8>, String>;
+
+/// How rows are written to a file of this name, which must not hold anything that is not ours.
+pub(super) fn table<R: mi::Row>(path: &Path, force: bool) -> Result<Write<R>, Error> {
+    io::refuse_existing(path, force)?;
+    storage::refuse_within_store(path)?;
+    let forms: [(&str, Write<R>); 3] = [("json", mi::to_json), ("csv", mi::to_csv), ("parquet", mi::to_parquet)];
+    let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
+    let form = forms.iter().find(|(name, _)| extension.as_deref() == Some(*name));
+    let usage = || {
+        Error::Usage(format!("--out: expected a name that ends in .json, .csv or .parquet, found {}", path.display()))
+    };
+    let write = form.map(|(_, write)| *write).ok_or_else(usage)?;
+    if path.symlink_metadata().is_ok() && !mi::holds::<R>(path) {
+        return Err(IoError::Foreign(path.to_owned()).into());
+    }
+    Ok(write)
+}
+
+/// Where a picture goes.
+pub(super) struct Picture {
+    path: PathBuf,
+    is_png: bool,
+}
+
+impl Picture {
+    /// Checks the name before anything is computed.
+    pub(super) fn at(path: &Path, force: bool) -> Result<Self, Error> {
+        let ends = |with: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(with));
+        if !ends("svg") && !ends("png") {
+            let message = format!("--plot: expected a name that ends in .svg or .png, found {}", path.display());
+            return Err(Error::Usage(message));
+        }
+        check(path, force, is_picture)?;
+        Ok(Self { path: path.to_owned(), is_png: ends("png") })
+    }
+
+    /// Where it goes.
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Draws the figure of this name.
+    pub(super) fn draw(&self, figure: &str, data: &Data) -> anyhow::Result<()> {
+        let entry = find("figure", FIGURES, figure)?;
+        if self.is_png {
+            let folder = tempfile::tempdir()?;
+            let whole = folder.path().join("figure.png");
+            figure::png(entry, data, &whole)?;
+            write_png(&self.path, &io::read_bytes(&whole, u64::MAX - 1).map_err(Error::from)?)?;
+        } else {
+            write_svg(&self.path, figure::svg(entry, data)?)?;
+        }
+        Ok(())
+    }
+}
+
 /// Writes SVG text with our mark.
 pub(super) fn write_svg(path: &Path, svg: String) -> Result<(), Error> {
     let line_end = if svg.ends_with('\n') { "" } else { "\n" };
@@ -42,7 +101,7 @@ pub(super) fn write_svg(path: &Path, svg: String) -> Result<(), Error> {
 }
 
 /// Writes a PNG file with our mark.
-pub(super) fn write_png(path: &Path, png: &[u8]) -> Result<(), Error> {
+fn write_png(path: &Path, png: &[u8]) -> Result<(), Error> {
     let (header, chunks) = png.split_at(PNG_HEADER.min(png.len()));
     Ok(io::write_atomic(path, &[header, PNG_MARK, chunks].concat())?)
 }

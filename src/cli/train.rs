@@ -6,11 +6,12 @@ use clap::ValueEnum;
 use serde_json::json;
 
 use super::args::{ScenarioArgs, stop_flag};
+use super::evaluate::print_channels;
 use super::{Outcome, ui};
 use crate::Error;
 use crate::link::LINKS;
 use crate::registry::Spec;
-use crate::train::{self, Options, Protocol, TrainConfig, TrainError};
+use crate::train::{self, Given, Options, Protocol, TrainConfig, TrainError};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -20,7 +21,8 @@ Examples:
   ccmarl train --out runs/x --resume
   ccmarl train --out runs/x --resume --steps 8000000
 
-Without --scenario and --config it is simple_spread with 3 agents.
+Without --scenario and --config it is simple_spread with 3 agents. A --config file also sets what has no flag, under the names of
+config.toml: messages = \"encoder\" below [maddpg] learns what a message is, in place of the sender's observation.
 The run directory holds config.toml (fully resolved), metrics.parquet, timings.parquet, TensorBoard events and checkpoint/,
 saved every 2000 updates and at the end (`ccmarl list metric` says what each column means). Ctrl-C saves and exits 4;
 --resume reads the run's own config.toml and goes on from its last checkpoint, to the same bytes as a run that was never
@@ -51,10 +53,10 @@ pub(super) struct Args {
     #[arg(long)]
     prior: Option<String>,
     /// Weight of JSD on delivered messages [default: the algorithm's]
-    #[arg(long)]
+    #[arg(long, allow_negative_numbers = true)]
     alpha: Option<f64>,
     /// Weight of CLUB on lost messages [default: the algorithm's]
-    #[arg(long)]
+    #[arg(long, allow_negative_numbers = true)]
     beta: Option<f64>,
     /// Worlds stepped together [default: the episodes between two updates, the same run as with 1; with more, a run
     /// resumed for longer differs from one of that length]
@@ -115,7 +117,10 @@ impl Args {
             let message = "there is no run to go on with; start it without --resume".to_owned();
             return Err(TrainError::Resume { message, path: self.out.clone() }.into());
         }
-        let file = self.config.as_deref().or(own.as_deref()).map(TrainConfig::read).transpose()?;
+        // the file may leave out what a flag says
+        let scenario = self.scenario.spec(None)?;
+        let given = Given { algorithm: self.algorithm.as_deref(), scenario: scenario.as_ref() };
+        let file = self.config.as_deref().or(own.as_deref()).map(|path| TrainConfig::read(path, given)).transpose()?;
         let mut config = file.unwrap_or_else(|| TrainConfig::new(Spec::new("simple_spread"), "cc-maddpg"));
         if let Some(spec) = self.scenario.spec(Some(config.scenario.clone()))? {
             config.scenario = spec;
@@ -157,6 +162,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         refuse_overlap(&args.out, record)?;
     }
     let config = args.config()?;
+    let log_every = config.log_every;
     let protocol = config.evaluation.protocol;
     if args.evaluate_every.is_some() && protocol != Protocol::Standard {
         let message = "--evaluate-every needs --evaluate standard: no other protocol tests during training";
@@ -182,11 +188,22 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
                 ("run", out.clone()),
                 ("steps", report.steps.to_string()),
                 ("updates", report.updates.to_string()),
-                ("training return", number(report.return_mean)),
+                (&*format!("training return, last logged {log_every} updates"), number(report.return_mean)),
                 ("loss of next batch", number(report.next_critic_loss)),
             ];
             ui::print_table(&["trained", ""], &rows.map(|(k, v)| vec![k.to_owned(), v]))?;
+            if let Some(test) = &report.test {
+                let team = if protocol == Protocol::Standard { "best" } else { "last" };
+                ui::print(&format!("test of the {team} team, that of step {}", test.trained))?;
+                print_channels(&test.channels)?;
+            }
         }
+    }
+    if report.was_finished {
+        let (steps, longer) = (report.steps, 2 * report.steps);
+        ui::say(&format!(
+            "the run was finished, at {steps} steps; to go on for longer: ccmarl train --out {out} --resume --steps {longer}"
+        ));
     }
     for name in &report.removed {
         ui::say(&format!("removed {name}: it was of the team before this run went on"));
@@ -202,10 +219,10 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         }
         return Ok(Outcome::Interrupted);
     }
-    if protocol == Protocol::Paper {
-        ui::say(&format!("next: ccmarl report {out} --out reports/first"));
-    } else {
+    if protocol == Protocol::None {
         ui::say(&format!("next: ccmarl evaluate {out} --suite paper"));
+    } else {
+        ui::say(&format!("next: ccmarl report {out} --out reports/first"));
     }
     Ok(Outcome::Done)
 }

@@ -169,7 +169,11 @@ pub(super) fn report_error(error: &anyhow::Error) -> ExitCode {
         return ExitCode::SUCCESS;
     }
     eprintln!("error: {}", crate::io::printable(&one_line(error)));
-    let usage = error.chain().any(|e| e.downcast_ref::<crate::Error>().is_some_and(crate::Error::is_usage));
+    let own = || error.chain().filter_map(|e| e.downcast_ref::<crate::Error>());
+    for line in own().filter_map(crate::Error::excerpt).flat_map(str::lines) {
+        eprintln!("  {}", crate::io::printable(line));
+    }
+    let usage = own().any(crate::Error::is_usage);
     ExitCode::from(if usage { 2 } else { 1 })
 }
 
@@ -182,7 +186,10 @@ mod tests {
         let source = || std::io::Error::other("is a directory");
         let own = crate::io::IoError::os("read", std::path::Path::new("d"))(source());
         assert_eq!(one_line(&crate::Error::from(own).into()), "could not read: is a directory: d");
-        assert_eq!(one_line(&anyhow::Error::from(source()).context("could not start")), "could not start: is a directory");
+        assert_eq!(
+            one_line(&anyhow::Error::from(source()).context("could not start")),
+            "could not start: is a directory"
+        );
     }
 
     #[test]

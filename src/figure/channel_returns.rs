@@ -24,7 +24,7 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, VPos};
 
 use crate::figure::style::{self, Area, Draw, Drawn};
-use crate::figure::{Data, FigureError, Render, Target};
+use crate::figure::{Data, FigureError, Render, Target, bars};
 use crate::registry::Entry;
 
 pub(super) const ENTRY: Entry<Render> = Entry {
@@ -45,23 +45,7 @@ struct Figure<'a> {
 }
 
 fn render(data: &Data, target: Target<'_>) -> Result<(), FigureError> {
-    if data.bars.is_empty() {
-        return Err(FigureError::Empty { figure: NAME, needs: "bar" });
-    }
-    let mut groups: Vec<&str> = Vec::new();
-    let (mut low, mut high) = (0.0_f64, 0.0_f64);
-    for bar in &data.bars {
-        for value in [bar.value, bar.low, bar.high] {
-            if !value.is_finite() {
-                let what = format!("the bar of {:?} at {:?}", bar.series, bar.group);
-                return Err(FigureError::NotFinite { figure: NAME, what, value });
-            }
-            (low, high) = (low.min(value), high.max(value));
-        }
-        if !groups.contains(&bar.group.as_str()) {
-            groups.push(&bar.group);
-        }
-    }
+    let (groups, (mut low, mut high)) = bars::extent(data, NAME)?;
     for line in data.references.iter().filter(|l| l.value.is_finite()) {
         (low, high) = (low.min(line.value), high.max(line.value));
     }

@@ -3,7 +3,9 @@
 //! A figure takes from [`Data`] what it needs and leaves the rest; equal data give equal bytes. Adding one: write
 //! `figure/<name>.rs` with an `ENTRY`, and add `mod <name>;` and `<name>::ENTRY,` below.
 
+mod bars;
 mod burst_lengths;
+mod calibration;
 mod channel_returns;
 mod learning_curves;
 mod lines;
@@ -32,6 +34,7 @@ pub const FIGURES: &[Entry<Render>] = &[
     loss_by_step::ENTRY,
     burst_lengths::ENTRY,
     loss_by_distance::ENTRY,
+    calibration::ENTRY,
     mi_pair::ENTRY,
     mi_by_lag::ENTRY,
 ];
@@ -294,6 +297,7 @@ mod tests {
                 "figure loss-by-step: expected at least one step with messages, found none",
                 "figure burst-lengths: expected at least one burst, found none",
                 "figure loss-by-distance: expected at least one bin of distance with messages, found none",
+                "figure calibration: expected at least one bar, found none",
                 "figure mi-pair: expected at least one point, found none",
                 "figure mi-by-lag: expected at least one lag with a value, found none",
             ]

@@ -3,12 +3,39 @@
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use polars::prelude::Column;
 use rayon::prelude::*;
 use serde::Serialize;
 
+use super::form::{Row, number, text};
 use super::tasks::Task;
 use super::{Estimate, Kind, Plan, Unit};
-use crate::rng::Seeds;
+use crate::rng::{Seeds, Stream};
+use crate::schema::Samples;
+
+/// What samples of known information are drawn from.
+pub trait Source: Send + Sync {
+    /// Its name, which its random numbers come from.
+    fn id(&self) -> String;
+    /// Its information, nats.
+    fn truth(&self) -> f64;
+    /// About `n` samples.
+    fn samples(&self, n: usize, rng: &mut Stream) -> Samples;
+}
+
+impl Source for Task {
+    fn id(&self) -> String {
+        self.id.to_owned()
+    }
+
+    fn truth(&self) -> f64 {
+        self.truth
+    }
+
+    fn samples(&self, n: usize, rng: &mut Stream) -> Samples {
+        Task::samples(self, n, rng)
+    }
+}
 
 /// One estimator on one task, over seeds.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -31,6 +58,26 @@ pub struct Calibrated {
     pub error: f64,
     /// Share of the intervals that hold the truth; none without intervals.
     pub covered: Option<f64>,
+    /// Share of the p-values that are at most 0.05: false positives where the truth is 0, else the power; none without
+    /// p-values.
+    pub rejected: Option<f64>,
+}
+
+impl Row for Calibrated {
+    fn columns(rows: &[Self]) -> Vec<Column> {
+        vec![
+            text("task", rows, |r| Some(r.task.clone())),
+            number("truth", rows, |r| Some(r.truth)),
+            text("estimator", rows, |r| Some(r.estimator.clone())),
+            text("kind", rows, |r| Some(r.kind.name().to_owned())),
+            Column::new("seeds".into(), rows.iter().map(|r| r.seeds as u64).collect::<Vec<u64>>()),
+            number("mean", rows, |r| Some(r.mean)),
+            number("deviation", rows, |r| r.deviation),
+            number("error", rows, |r| Some(r.error)),
+            number("covered", rows, |r| r.covered),
+            number("rejected", rows, |r| r.rejected),
+        ]
+    }
 }
 
 impl Calibrated {
@@ -52,11 +99,18 @@ pub struct Drawn {
 
 /// Runs every estimator of the plan on `seeds` draws of `n` samples of every task, in parallel, and hands out each draw
 /// as soon as it is there; once `stop` is raised, no draw is started.
-pub fn calibrate(tasks: &[Task], plan: &Plan, n: usize, seeds: u64, stop: &AtomicBool, tell: &(dyn Fn(Drawn) + Sync)) {
+pub fn calibrate<S: Source>(
+    tasks: &[S],
+    plan: &Plan,
+    n: usize,
+    seeds: u64,
+    stop: &AtomicBool,
+    tell: &(dyn Fn(Drawn) + Sync),
+) {
     let root = Seeds::new(plan.seed).child("calibrate");
     let draws: Vec<(usize, u64)> = (0..tasks.len()).flat_map(|t| (0..seeds).map(move |s| (t, s))).collect();
     draws.par_iter().filter(|_| !stop.load(Ordering::SeqCst)).for_each(|&(task, seed)| {
-        let own = root.child(tasks[task].id).indexed("seed", seed);
+        let own = root.child(&tasks[task].id()).indexed("seed", seed);
         let samples = tasks[task].samples(n, &mut own.stream("samples"));
         let of = |(place, (name, estimator)): (usize, &super::Named)| {
             let rows = estimator.estimate(&samples, &plan.protocol, &own.child(name)).unwrap_or_default();
@@ -69,7 +123,7 @@ pub fn calibrate(tasks: &[Task], plan: &Plan, n: usize, seeds: u64, stop: &Atomi
 
 /// What draws say about estimators, by task and then by estimator; some draws may be missing. Values on another scale
 /// than nats are left out.
-pub fn calibrated(tasks: &[Task], mut draws: Vec<Drawn>) -> Vec<Calibrated> {
+pub fn calibrated<S: Source>(tasks: &[S], mut draws: Vec<Drawn>) -> Vec<Calibrated> {
     draws.sort_by_key(|draw| (draw.task, draw.seed));
     // by task, by estimator as asked, and by its rows as they come
     let mut groups: BTreeMap<(usize, usize), ByName> = BTreeMap::new();
@@ -89,22 +143,26 @@ pub fn calibrated(tasks: &[Task], mut draws: Vec<Drawn>) -> Vec<Calibrated> {
     groups.into_iter().flat_map(summaries).collect()
 }
 
-fn summary(task: &Task, estimator: String, rows: &[Estimate]) -> Calibrated {
+fn summary(task: &impl Source, estimator: String, rows: &[Estimate]) -> Calibrated {
     let n = rows.len() as f64;
     let mean = rows.iter().map(|r| r.value).sum::<f64>() / n;
     let squares: f64 = rows.iter().map(|r| (r.value - mean) * (r.value - mean)).sum();
     let intervals: Vec<(f64, f64)> = rows.iter().filter_map(|r| r.interval_low.zip(r.interval_high)).collect();
-    let holding = intervals.iter().filter(|(low, high)| *low <= task.truth && task.truth <= *high).count();
+    let truth = task.truth();
+    let holding = intervals.iter().filter(|(low, high)| *low <= truth && truth <= *high).count();
+    let p_values: Vec<f64> = rows.iter().filter_map(|r| r.p_value).collect();
+    let small = p_values.iter().filter(|p| **p <= 0.05).count();
     Calibrated {
-        task: task.id.to_owned(),
-        truth: task.truth,
+        task: task.id(),
+        truth,
         estimator,
         kind: rows[0].kind,
         seeds: rows.len(),
         mean,
         deviation: (rows.len() > 1).then(|| libm::sqrt(squares / (n - 1.0))),
-        error: rows.iter().map(|r| (r.value - task.truth).abs()).sum::<f64>() / n,
+        error: rows.iter().map(|r| (r.value - truth).abs()).sum::<f64>() / n,
         covered: (!intervals.is_empty()).then(|| holding as f64 / intervals.len() as f64),
+        rejected: (!p_values.is_empty()).then(|| small as f64 / p_values.len() as f64),
     }
 }
 
@@ -139,7 +197,7 @@ mod tests {
         impl crate::mi::Estimator for Moody {
             fn estimate(
                 &self,
-                samples: &crate::schema::Samples,
+                samples: &Samples,
                 _: &crate::mi::Protocol,
                 _: &Seeds,
             ) -> Result<Vec<Estimate>, crate::mi::MiError> {
@@ -165,10 +223,11 @@ mod tests {
             row
         };
         let task = TASKS[3];
-        let rows = [row(0.3, 0.2, 0.32), row(0.4, 0.3, 0.5)];
+        let mut rows = [row(0.3, 0.2, 0.32), row(0.4, 0.3, 0.5)];
+        (rows[0].p_value, rows[1].p_value) = (Some(0.05), Some(0.06));
         let found = summary(&task, "e".to_owned(), &rows);
         assert!((found.mean - 0.35).abs() < 1e-12 && (found.error - 0.05).abs() < 1e-12);
         assert!((found.deviation.unwrap() - 0.005f64.sqrt()).abs() < 1e-12);
-        assert_eq!((found.covered, found.is_right()), (Some(0.5), true));
+        assert_eq!((found.covered, found.is_right(), found.rejected), (Some(0.5), true, Some(0.5)));
     }
 }

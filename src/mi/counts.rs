@@ -120,11 +120,17 @@ impl Table {
 
     /// Σ p(x,y)²/p(x)p(y): 1 without dependence, the number of categories when x determines y and y x.
     pub(super) fn association(&self) -> f64 {
-        let term = |&((a, b), count): &((u32, u32), u32)| {
-            let product = f64::from(self.x[a as usize]) * f64::from(self.y[b as usize]);
-            f64::from(count) * f64::from(count) / product
-        };
-        self.joint.iter().map(term).sum()
+        self.cells().map(|(_, c, [a, b])| f64::from(c) * f64::from(c) / (f64::from(a) * f64::from(b))).sum()
+    }
+
+    /// The pairs that occur, how often, and how often their categories of x and of y do.
+    pub(super) fn cells(&self) -> impl Iterator<Item = ((u32, u32), u32, [u32; 2])> {
+        self.joint.iter().map(|&((a, b), count)| ((a, b), count, [self.x[a as usize], self.y[b as usize]]))
+    }
+
+    /// How often each category of x, and of y, occurs.
+    pub(super) fn margins(&self) -> [&[u32]; 2] {
+        [&self.x, &self.y]
     }
 
     /// Pairs of categories that occur.
@@ -134,7 +140,7 @@ impl Table {
 
     /// Categories of x, and of y, that occur.
     pub(super) fn occurring(&self) -> [usize; 2] {
-        [&self.x, &self.y].map(|counts| counts.iter().filter(|&&c| c > 0).count())
+        self.margins().map(|counts| counts.iter().filter(|&&c| c > 0).count())
     }
 
     /// ln p(x,y)/p(x)p(y) of each of the pairs that were counted, in their order.

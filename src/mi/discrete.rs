@@ -17,14 +17,16 @@
 //! None. Both intervals cover the truth. That of `discrete-mm` holds all I that the corrected value lies within t standard errors
 //! of, the variance growing with I: the spread of the local terms over whole episodes, joined with
 //! √((`K_xy` − `K_x` − `K_y` + 1)/2 + φ²)/n, φ² = Σ p̂(x,y)²/p̂(x)p̂(y) − 1, which is the second order of the same expansion and
-//! remains when the local terms do not vary: without dependence, and in a copy. That of `discrete` reaches up to its own
+//! remains when the local terms do not vary: without dependence, and in a copy. Downwards it also reaches as far as with the bias
+//! of the pairs that independence would leave unseen, as with two samples' worth of independence mixed in (a copy without exception may
+//! have exceptions), and to 0 when the p-value is above 0.05. That of `discrete` reaches up to its own
 //! value. `discrete-mm` is held to ln of the fewer categories of x and y, and to minus that remaining error. The p-value permutes whole
 //! episodes; given z, x within equal z, if every sample is its own episode.
 //!
 //! # When it fails
 //!
 //! Continuous columns: every value is a category of its own, and the value is ln n whatever the dependence. With few
-//! samples per pair of categories the bias is no longer as Miller and Madow have it; with less than two there is no
+//! samples per pair of categories the bias is no longer as Miller and Madow have it; with less than four there is no
 //! interval. All this is said.
 //!
 //! # Reference
@@ -40,6 +42,7 @@ use super::discrete_pass::DiscretePass;
 use super::given::NO_NULL;
 use super::interval::{Interval, Scatter, block_interval, t_quantile};
 use super::part::Part;
+use super::unseen::{Strata, Unseen};
 use super::{Build, Estimate, Estimator, Kind, MiError, OnePass, Protocol, Unit, p_value};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
@@ -57,6 +60,8 @@ pub(super) const ENTRY: Entry<Build> = Entry {
 /// Bias in nats from which it is worth a warning.
 const BIASED: f64 = 0.02;
 
+/// Samples per pair of categories below which there is no interval.
+const CROWDED: usize = 4;
 /// Error of the local terms in nats under which they do not vary.
 const FLAT: f64 = 1e-12;
 
@@ -103,7 +108,8 @@ impl Estimator for Discrete {
         }
         let p = p_value(table.information(), null.as_deref().unwrap_or_default());
         let words = [&samples.x, &samples.y].map(|c| (0..c.width()).any(|at| c.is_words(at)));
-        let counted = Counted { table, of_z, distinct: [distinct_x, distinct_y], n, words };
+        let strata = strata_of(z.as_ref(), [&x, &y], rows);
+        let counted = Counted { table, of_z, strata, distinct: [distinct_x, distinct_y], n, words };
         Ok(counted.rows(labels, local, p, notes))
     }
 
@@ -126,6 +132,8 @@ pub(super) struct Counted {
     pub(super) table: Table,
     /// z with itself.
     pub(super) of_z: Option<Table>,
+    /// Which value of z belongs to which categories.
+    pub(super) strata: Strata,
     /// Categories of x, and of y.
     pub(super) distinct: [usize; 2],
     pub(super) n: usize,
@@ -155,8 +163,8 @@ impl Counted {
         for (at, label) in [&labels.x, &labels.y].into_iter().enumerate() {
             warnings.extend(sparse(self.distinct[at], n, self.words[at], label));
         }
-        // where most pairs of categories occur once, their frequencies say nothing about the error either
-        let crowded = table.pairs() * 2 > n;
+        // where pairs of categories occur a few times, their frequencies say little about the error either
+        let crowded = table.pairs() * CROWDED > n;
         if crowded {
             warnings
                 .push(format!("{} pairs of categories in {n} samples: no interval; merge categories", table.pairs()));
@@ -174,8 +182,16 @@ impl Counted {
         let second = 0.5 * degrees + table.association() - strata as f64;
         let chance = libm::sqrt(second.max(0.0)) / independent;
         let scatter = Scatter { seen: value, error: local.error, chance, n: independent };
-        let corrected = value - bias;
-        let (low, high) = scatter.around(corrected, t_quantile(local.blocks));
+        let (corrected, t) = (value - bias, t_quantile(local.blocks));
+        let (mut low, high) = scatter.around(corrected, t);
+        if !crowded {
+            let unseen = Unseen::of(table, &self.strata, n, independent);
+            low = low.min(scatter.around(corrected - unseen.pairs / (2.0 * n as f64), t).0);
+            low = low.min(Scatter { error: unseen.error, ..scatter }.around(unseen.value - bias, t).0);
+        }
+        if p.is_some_and(|p| p > 0.05) {
+            low = low.min(0.0);
+        }
         let row = |name: &str, value: f64| {
             let mut row = Estimate::new(name, labels, value, Unit::Nats, Kind::Estimate, n);
             row.n_effective = independent;
@@ -189,6 +205,19 @@ impl Counted {
         let most = libm::log(self.distinct[0].min(self.distinct[1]) as f64);
         vec![row("discrete", value), row("discrete-mm", corrected.clamp(-chance, most))]
     }
+}
+
+/// Which categories, joined with z, belong to which value of z.
+fn strata_of(z: Option<&Categories>, sides: [&Categories; 2], rows: &[u32]) -> Strata {
+    let mut sizes = vec![0; z.map_or(1, |z| z.count)];
+    let stratum = |r: u32| z.map_or(0, |z| z.of[r as usize]);
+    let [of_x, of_y] = sides.map(|side| {
+        let mut of = vec![0; side.count];
+        rows.iter().for_each(|&r| of[side.of[r as usize] as usize] = stratum(r));
+        of
+    });
+    rows.iter().for_each(|&r| sizes[stratum(r) as usize] += 1);
+    Strata { of_x, of_y, sizes }
 }
 
 /// Says when nearly every sample is a category of its own, and what to do.

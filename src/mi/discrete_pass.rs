@@ -7,6 +7,7 @@ use statrs::distribution::{ChiSquared, ContinuousCDF as _};
 use super::counts::Table;
 use super::discrete::Counted;
 use super::interval::{Interval, t_quantile};
+use super::unseen::Strata;
 use super::{Estimate, MiError, NOTE, OnePass};
 use crate::schema::{Columns, SampleLabels, Samples};
 
@@ -105,7 +106,8 @@ impl OnePass for DiscretePass {
         }
         let table = Table::of_counts(&sums.joint);
         let of_z = self.given.then(|| Table::of_counts(&sums.of_z));
-        let counted = Counted { table, of_z, distinct, n: self.rows, words: self.words };
+        let strata = sums.strata();
+        let counted = Counted { table, of_z, strata, distinct, n: self.rows, words: self.words };
         let local = self.local();
         // (K_x − 1)(K_y − 1), summed over the strata of z
         let mut strata: BTreeMap<u32, [f64; 2]> = BTreeMap::new();
@@ -127,6 +129,20 @@ struct Sums {
     yz: BTreeMap<(u32, u32), u32>,
     joint: BTreeMap<(u32, u32), u32>,
     of_z: BTreeMap<(u32, u32), u32>,
+}
+
+impl Sums {
+    /// Which categories of x and y belong to which value of z.
+    fn strata(&self) -> Strata {
+        let of = |pairs: &BTreeMap<(u32, u32), u32>| {
+            let mut out = vec![0; pairs.len()];
+            pairs.iter().for_each(|(&(_, z), &at)| out[at as usize] = z);
+            out
+        };
+        let mut sizes = vec![0; self.of_z.keys().map(|&(z, _)| z as usize + 1).max().unwrap_or(0)];
+        self.of_z.iter().for_each(|(&(z, _), &count)| sizes[z as usize] = count);
+        Strata { of_x: of(&self.xz), of_y: of(&self.yz), sizes }
+    }
 }
 
 impl DiscretePass {

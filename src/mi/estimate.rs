@@ -1,20 +1,12 @@
-//! The output row, and its three file forms.
+//! The output row.
 
 use std::f64::consts::LN_2;
-use std::fs::File;
-use std::io::{BufRead as _, BufReader, Read as _};
-use std::path::Path;
 
-use polars::prelude::{
-    Column, CsvWriter, DataFrame, ParquetReader, ParquetWriter, PlSmallStr, SerReader as _, SerWriter as _,
-};
+use polars::prelude::Column;
 use serde::Serialize;
 
-use crate::io;
+use super::form::{Row, number, text};
 use crate::schema::SampleLabels;
-
-/// Largest file of estimates that is recognised, bytes.
-const FILE_LIMIT: u64 = 64 << 20;
 
 /// What the value is to the truth.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -142,98 +134,35 @@ impl Estimate {
     }
 }
 
-/// The rows as indented JSON.
-///
-/// # Errors
-/// A message, should serde refuse.
-pub fn to_json(rows: &[Estimate]) -> Result<Vec<u8>, String> {
-    let mut text = serde_json::to_vec_pretty(rows).map_err(|e| e.to_string())?;
-    text.push(b'\n');
-    Ok(text)
-}
-
-/// The rows as a Parquet file; warnings are joined by `; `.
-///
-/// # Errors
-/// A message, should polars refuse.
-pub fn to_parquet(rows: &[Estimate]) -> Result<Vec<u8>, String> {
-    let mut bytes = Vec::new();
-    let mut frame = frame(rows)?;
-    ParquetWriter::new(&mut bytes).finish(&mut frame).map_err(|e| e.to_string())?;
-    Ok(bytes)
-}
-
-/// The rows as CSV with a header; warnings are joined by `; `.
-///
-/// # Errors
-/// A message, should polars refuse.
-pub fn to_csv(rows: &[Estimate]) -> Result<Vec<u8>, String> {
-    let mut bytes = Vec::new();
-    CsvWriter::new(&mut bytes).finish(&mut frame(rows)?).map_err(|e| e.to_string())?;
-    Ok(bytes)
-}
-
-/// Whether a file holds such rows and nothing else, by its ending and its columns; an empty file is nobody's.
-pub fn is_estimates(path: &Path) -> bool {
-    let keys: Vec<String> = match frame(&[]) {
-        Ok(frame) => frame.get_column_names().iter().map(ToString::to_string).collect(),
-        Err(_) => return false,
-    };
-    let Ok(file) = File::open(path) else { return false };
-    if file.metadata().is_ok_and(|file| file.is_file() && file.len() == 0) {
-        return true;
+impl Row for Estimate {
+    /// Warnings are joined by `; `.
+    fn columns(rows: &[Self]) -> Vec<Column> {
+        vec![
+            text("estimator", rows, |r| Some(r.estimator.clone())),
+            text("x", rows, |r| Some(r.x.clone())),
+            text("y", rows, |r| Some(r.y.clone())),
+            text("given", rows, |r| r.given.clone()),
+            text("sender", rows, |r| r.sender.clone()),
+            text("receiver", rows, |r| r.receiver.clone()),
+            Column::new("delivered".into(), rows.iter().map(|r| r.delivered).collect::<Vec<Option<bool>>>()),
+            text("group", rows, |r| Some(r.group.clone())),
+            number("value", rows, |r| Some(r.value)),
+            text("unit", rows, |r| Some(r.unit.name().to_owned())),
+            text("kind", rows, |r| Some(r.kind.name().to_owned())),
+            number("interval_low", rows, |r| r.interval_low),
+            number("interval_high", rows, |r| r.interval_high),
+            number("p_value", rows, |r| r.p_value),
+            Column::new("n".into(), rows.iter().map(|r| r.n).collect::<Vec<u64>>()),
+            number("n_effective", rows, |r| Some(r.n_effective)),
+            text("warnings", rows, |r| Some(r.warnings.join("; "))),
+        ]
     }
-    match path.extension().map(|ending| ending.to_string_lossy().to_lowercase()).as_deref() {
-        Some("json") => {
-            let text = io::read_text(path, FILE_LIMIT).unwrap_or_default();
-            let rows = serde_json::from_str::<Vec<serde_json::Map<String, serde_json::Value>>>(&text);
-            rows.is_ok_and(|rows| rows.iter().all(|row| row.keys().eq(&keys)))
-        }
-        Some("csv") => {
-            let mut header = String::new();
-            let read = BufReader::new(file.take(4096)).read_line(&mut header);
-            read.is_ok() && header.trim_end() == keys.join(",")
-        }
-        Some("parquet") => {
-            let schema = io::caught(|| ParquetReader::new(file).schema());
-            schema.is_some_and(|schema| schema.is_ok_and(|s| s.iter_names().map(PlSmallStr::as_str).eq(keys.iter())))
-        }
-        _ => false,
-    }
-}
-
-fn frame(rows: &[Estimate]) -> Result<DataFrame, String> {
-    let text = |name: &str, of: fn(&Estimate) -> Option<String>| {
-        Column::new(name.into(), rows.iter().map(of).collect::<Vec<Option<String>>>())
-    };
-    let number = |name: &str, of: fn(&Estimate) -> Option<f64>| {
-        Column::new(name.into(), rows.iter().map(of).collect::<Vec<Option<f64>>>())
-    };
-    let columns = vec![
-        text("estimator", |r| Some(r.estimator.clone())),
-        text("x", |r| Some(r.x.clone())),
-        text("y", |r| Some(r.y.clone())),
-        text("given", |r| r.given.clone()),
-        text("sender", |r| r.sender.clone()),
-        text("receiver", |r| r.receiver.clone()),
-        Column::new("delivered".into(), rows.iter().map(|r| r.delivered).collect::<Vec<Option<bool>>>()),
-        text("group", |r| Some(r.group.clone())),
-        number("value", |r| Some(r.value)),
-        text("unit", |r| Some(r.unit.name().to_owned())),
-        text("kind", |r| Some(r.kind.name().to_owned())),
-        number("interval_low", |r| r.interval_low),
-        number("interval_high", |r| r.interval_high),
-        number("p_value", |r| r.p_value),
-        Column::new("n".into(), rows.iter().map(|r| r.n).collect::<Vec<u64>>()),
-        number("n_effective", |r| Some(r.n_effective)),
-        text("warnings", |r| Some(r.warnings.join("; "))),
-    ];
-    DataFrame::new(rows.len(), columns).map_err(|e| e.to_string())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mi::{to_csv, to_parquet};
 
     #[test]
     fn the_keys_are_those_of_the_design_in_order() {

@@ -220,8 +220,13 @@ pub(super) fn information_of(joint: &Symmetric, n: f64, dx: usize, dy: usize, gi
     // the joint pivots start with those of x alone; what follows is y given x
     let pivots = joint.cholesky(COLLINEAR).pivots;
     let alone = joint.block(dx..dx + dy).cholesky(COLLINEAR).pivots;
-    let bias = |d: usize| (1..=d).map(|i| digamma((n - (given + i) as f64) / 2.0)).sum::<f64>();
-    0.5 * (log_det(&alone) - log_det(&pivots[dx..]) - (bias(dx) + bias(dy) - bias(dx + dy)))
+    0.5 * (log_det(&alone) - log_det(&pivots[dx..])) - bias(n, dx, dy, given)
+}
+
+/// What the value is too high by, for `n` normal samples, nats.
+pub(super) fn bias(n: f64, dx: usize, dy: usize, given: usize) -> f64 {
+    let of = |d: usize| (1..=d).map(|i| digamma((n - (given + i) as f64) / 2.0)).sum::<f64>();
+    0.5 * (of(dx) + of(dy) - of(dx + dy))
 }
 
 /// ½ \[`m_x` + `m_y` − `m_xy`\] per sample, m the squared Mahalanobis distances: its spread over samples and over episodes

@@ -35,6 +35,7 @@ use std::sync::Arc;
 use statrs::distribution::{ContinuousCDF as _, Normal};
 
 use super::prepare::tied;
+use super::student::doubled_ranks;
 use super::{Build, Estimate, Estimator, Kind, MiError, Protocol, gaussian};
 use crate::registry::{Entry, RegistryError, Spec};
 use crate::rng::Seeds;
@@ -74,21 +75,9 @@ impl Estimator for Gcmi {
 
 /// Every value's place among the values of its column in `rows`, as a normal quantile; rows outside `rows` likewise.
 pub(super) fn normal_scores(columns: &Columns, rows: &[u32]) -> Columns {
-    let (width, n) = (columns.width(), rows.len() as f64);
-    let normal = Normal::standard();
-    let mut data = vec![0.0; columns.data.len()];
-    for c in 0..width {
-        let mut sorted: Vec<f64> = rows.iter().map(|&r| columns.row(r as usize)[c]).collect();
-        sorted.sort_unstable_by(f64::total_cmp);
-        for (from, to) in columns.data.chunks_exact(width).zip(data.chunks_exact_mut(width)) {
-            let below = sorted.partition_point(|&v| v < from[c]);
-            let upto = sorted.partition_point(|&v| v <= from[c]);
-            // mean of the ranks below + 1, …, upto
-            let rank = 0.5 * (below + upto + 1) as f64;
-            to[c] = normal.inverse_cdf(rank / (n + 1.0));
-        }
-    }
-    Columns::new(data, columns.names.clone())
+    let (normal, n) = (Normal::standard(), rows.len() as f64);
+    let score = |&rank: &u32| normal.inverse_cdf(0.5 * f64::from(rank) / (n + 1.0));
+    Columns::new(doubled_ranks(&columns.data, columns.width(), rows).iter().map(score).collect(), columns.names.clone())
 }
 
 #[cfg(test)]

@@ -59,15 +59,19 @@ pub(super) struct Scatter {
 impl Scatter {
     /// Ends of the interval of the information around its bias-corrected `value`, `t` standard errors wide.
     ///
-    /// All I with |value − I| ≤ t √(c I + chance²). The variance that dependence brings is taken to grow with I: by c = error²/seen, or by
-    /// 2/n where little is seen (the limit of weak dependence, of any kind); the two are joined with the weights seen and chance.
+    /// All I with |value − I| ≤ t √(V(I) + chance²). V, the variance that dependence brings, is error² where I is what was
+    /// seen; where little is seen it is 2 I/n (the limit of weak dependence, of any kind), and the two are joined with the
+    /// weights seen and chance. Around there it is taken to grow with I as 1 − e^(−2I) does, which is exact for one pair of normals.
     /// An interval value ± t·error would be twice too wide without dependence. The value itself is always inside.
     pub(super) fn around(self, value: f64, t: f64) -> (f64, f64) {
         let weak = 2.0 / self.n;
-        let weight = self.seen.max(0.0) + self.chance;
-        let slope = if weight > 0.0 { (self.error * self.error + weak * self.chance) / weight } else { weak };
+        let seen = self.seen.max(0.0);
+        let weight = seen + self.chance;
+        let ratio = if weight > 0.0 { (self.error * self.error + weak * self.chance) / weight } else { weak };
+        let slope = if seen > 1e-9 { ratio * 2.0 * seen / libm::expm1(2.0 * seen) } else { ratio };
         let shift = 0.5 * t * t * slope;
-        let square = shift * shift + 2.0 * shift * value + t * t * self.chance * self.chance;
+        let variance = ratio * seen + slope * (value - seen) + self.chance * self.chance;
+        let square = shift * shift + t * t * variance;
         let half = libm::sqrt(square.max(0.0));
         ((value + shift - half).min(value), (value + shift + half).max(value))
     }

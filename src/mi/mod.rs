@@ -6,13 +6,15 @@
 //! Adding an estimator: write `mi/<name>.rs` with an `ENTRY`, and add `mod <name>;` and `<name>::ENTRY,` below. The
 //! rest of the room is protocol: `prepare` (standardised, split by episode), `fit` (training, stopped on validation),
 //! `interval` (episodes as blocks), `null` (whole episodes permuted), `part` (parts of the samples by whole episodes),
-//! `run` (all jobs in parallel); and what several share: `critic`,
-//! `scorer`, `bounds`, `contrast` and `contrast_given` (trained critics), `linear` (covariances), `given` (z), `knn` and `neighbours`, `counts`.
+//! `run` (all jobs in parallel), `form` (rows as files); and what several share: `critic`, `scorer`, `bounds`, `contrast`
+//! and `contrast_given` (trained critics), `linear` (covariances), `student` (t copulas), `given` (z), `knn` and
+//! `neighbours`, `counts`, `unseen`.
 
 pub(crate) mod all_pairs;
 mod auto;
 mod bounds;
 mod calibrate;
+mod checks;
 mod club;
 mod club_sample;
 pub mod conditional;
@@ -25,6 +27,7 @@ mod discrete_pass;
 mod estimate;
 mod extrapolate;
 mod fit;
+mod form;
 mod gaussian;
 mod gaussian_pass;
 mod gcmi;
@@ -51,12 +54,17 @@ mod run;
 mod scorer;
 pub(crate) mod shifted;
 mod smile;
+mod student;
+mod t_copula;
 mod tasks;
+mod unseen;
 
-pub use calibrate::{Calibrated, Drawn, calibrate, calibrated};
-pub use estimate::{Estimate, Kind, Unit, is_estimates, to_csv, to_json, to_parquet};
+pub use calibrate::{Calibrated, Drawn, Source, calibrate, calibrated};
+pub use checks::{Check, NORMALS, SERIES};
+pub use estimate::{Estimate, Kind, Unit};
 pub use extrapolate::{DIVISIONS, Extrapolated, PartValue, extrapolated, part_value};
 pub use fit::Training;
+pub use form::{Row, holds, to_csv, to_json, to_parquet};
 pub use interval::{Interval, block_interval};
 pub use jsd::certified;
 pub use negatives::{all_others, derangements};
@@ -88,6 +96,7 @@ pub const ESTIMATORS: &[Entry<Build>] = &[
     mine::ENTRY,
     nwj::ENTRY,
     smile::ENTRY,
+    t_copula::ENTRY,
 ];
 
 /// What an entry of `warnings` begins with that explains and does not warn.

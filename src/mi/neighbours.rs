@@ -21,6 +21,10 @@ const SAME: f64 = 1e-14;
 /// The same, as a share of the distance.
 const SAME_SHARE: f64 = 1e-9;
 
+/// The variance times the number m of samples grows as m/(m + 9 k): measured on normals without dependence, k = 3, as 0.34
+/// at m = 50, 0.43 at 100, 0.48 at 250, 0.51 at 500; it grows less with dependence.
+const GROWTH: f64 = 9.0;
+
 /// Joint columns above which the estimate is said to be too low.
 const WIDE: usize = 8;
 
@@ -95,10 +99,13 @@ impl Neighbours {
         let statistic = |from: &[u32], rows: &[u32]| mean(&terms(from, rows));
         let limits = Limits::of(width);
         let part = Part::drawn(samples, limits.interval, &seeds.child("interval"));
-        let error = part.subsampled_error(n, 4 * (self.k + 1), seeds, &|rows| statistic(rows, rows));
-        if let Some((error, degrees)) = error {
-            let half = error * t_quantile(degrees + 1);
-            (out.interval_low, out.interval_high) = (Some(value - half), Some(value + half));
+        let subsampled = part.subsampled_error(n, 4 * (self.k + 1), seeds, &|rows| statistic(rows, rows));
+        if let Some(of) = subsampled {
+            // what more samples would still change is an error too, of known sign: in more than two columns no small one
+            let (half, drift) =
+                (of.error_on(n, GROWTH * self.k as f64) * t_quantile(of.degrees + 1), of.drift(value, n));
+            (out.interval_low, out.interval_high) =
+                (Some(value - half + drift.min(0.0)), Some(value + half + drift.max(0.0)));
         }
         let part = Part::drawn(samples, limits.null, &seeds.child("null"));
         if protocol.permutations > 0 {

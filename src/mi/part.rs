@@ -8,13 +8,38 @@ use super::{Protocol, permuted_rows};
 use crate::rng::{self, Seeds};
 use crate::schema::{Exchange, Samples};
 
-/// Groups into which one round of subsampling deals the episodes. Few: the variance times the size of a group grows with the
-/// size (nearest neighbours without dependence: 0.34 at 50, 0.43 at 100, 0.51 at 500), so small groups promise too much.
+/// Groups into which one round of subsampling deals the episodes: few, since small groups tell less of all samples.
 const GROUPS: usize = 4;
 /// Rounds of subsampling.
 const ROUNDS: usize = 10;
 /// Fewest episodes in a part, if there are as many.
 const LEAST: usize = 20;
+
+/// What subsampling says about a statistic.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Subsampled {
+    /// Its standard error on all samples, should its variance fall as their number.
+    pub(super) error: f64,
+    /// Degrees of freedom of that.
+    pub(super) degrees: usize,
+    /// Its mean over groups.
+    mean: f64,
+    /// Samples of a group.
+    size: f64,
+}
+
+impl Subsampled {
+    /// The error on `n` samples of a statistic whose variance times the number m of samples grows as m/(m + `growth`).
+    pub(super) fn error_on(self, n: usize, growth: f64) -> f64 {
+        self.error * libm::sqrt((1.0 + growth / self.size) / (1.0 + growth / n as f64))
+    }
+
+    /// How far a statistic with this value on `n` samples may still be from where it goes as samples are added, if what
+    /// is left falls as 1/√n.
+    pub(super) fn drift(self, value: f64, n: usize) -> f64 {
+        (value - self.mean) / (libm::sqrt(n as f64 / self.size) - 1.0)
+    }
+}
 
 /// Some episodes, ascending, and their samples.
 pub(super) struct Part {
@@ -75,6 +100,12 @@ impl Part {
         self.episodes.len()
     }
 
+    /// Episode of each of the rows.
+    pub(super) fn blocks(&self) -> Vec<u32> {
+        let spans = self.bounds.windows(2).zip(&self.episodes);
+        spans.flat_map(|(span, &episode)| std::iter::repeat_n(episode, span[1] - span[0])).collect()
+    }
+
     /// `statistic` under draws of the null: it is given, for each of the rows, the row whose x takes its place.
     pub(super) fn null(
         &self,
@@ -107,7 +138,7 @@ impl Part {
         (self.len() == self.rows.len()).then(|| (0..protocol.permutations).into_par_iter().map(draw).collect())
     }
 
-    /// The standard error that `statistic` has on `n` samples, and its degrees of freedom: the episodes are dealt into
+    /// The standard error that `statistic` has on `n` samples, and its mean on fewer: the episodes are dealt into
     /// four groups, ten times over, and the variance between groups is scaled by their size (Holmes, Nemenman 2019).
     /// `None` when two groups of `least` samples cannot be made.
     pub(super) fn subsampled_error(
@@ -116,7 +147,7 @@ impl Part {
         least: usize,
         seeds: &Seeds,
         statistic: &(dyn Fn(&[u32]) -> f64 + Sync),
-    ) -> Option<(f64, usize)> {
+    ) -> Option<Subsampled> {
         let groups = GROUPS.min(self.len() / 2).min(self.rows.len() / least.max(1));
         if groups < 2 {
             return None;
@@ -132,13 +163,15 @@ impl Part {
             };
             let values: Vec<f64> = (0..groups).map(value).collect();
             let mean = values.iter().sum::<f64>() / groups as f64;
-            values.iter().map(|v| (v - mean) * (v - mean)).sum::<f64>()
+            (mean, values.iter().map(|v| (v - mean) * (v - mean)).sum::<f64>())
         };
-        let squares: Vec<f64> = (0..ROUNDS).into_par_iter().map(round).collect();
-        let between = squares.iter().sum::<f64>() / (ROUNDS * (groups - 1)) as f64;
+        let rounds: Vec<(f64, f64)> = (0..ROUNDS).into_par_iter().map(round).collect();
+        let between = rounds.iter().map(|r| r.1).sum::<f64>() / (ROUNDS * (groups - 1)) as f64;
+        let mean = rounds.iter().map(|r| r.0).sum::<f64>() / ROUNDS as f64;
         let size = self.rows.len() as f64 / groups as f64;
         let error = libm::sqrt(between * size / n as f64);
-        error.is_finite().then_some((error, (ROUNDS * (groups - 1)).min(self.len() - 1)))
+        let degrees = (ROUNDS * (groups - 1)).min(self.len() - 1);
+        error.is_finite().then_some(Subsampled { error, degrees, mean, size })
     }
 }
 
@@ -151,8 +184,16 @@ mod tests {
     fn the_subsampled_error_of_a_mean_is_its_standard_error() {
         let samples = linear_samples(0.0, 2000, 1, 1);
         let mean = |rows: &[u32]| rows.iter().map(|&r| samples.x.data[r as usize]).sum::<f64>() / rows.len() as f64;
-        let (error, degrees) = Part::all(&samples).subsampled_error(2000, 5, &Seeds::new(1), &mean).unwrap();
+        let found = Part::all(&samples).subsampled_error(2000, 5, &Seeds::new(1), &mean).unwrap();
+        let (error, degrees) = (found.error, found.degrees);
         let expected = 1.0 / 2000f64.sqrt();
+        // a mean of 2000 is the mean of means of 500, and what falls as 1/√n is known from both
+        assert!(found.drift(mean(&samples.rows), 2000).abs() < 1e-12);
+        let falling = |rows: &[u32]| 1.0 - 1.0 / (rows.len() as f64).sqrt();
+        let found = Part::all(&samples).subsampled_error(2000, 5, &Seeds::new(1), &falling).unwrap();
+        // the variance of 500, and of 2000 if it grows as m/(m + 500)
+        assert!((found.error_on(2000, 500.0) - found.error * 1.6f64.sqrt()).abs() < 1e-12);
+        assert!((found.drift(falling(&samples.rows), 2000) - 1.0 / 2000f64.sqrt()).abs() < 1e-12);
         assert!((error / expected - 1.0).abs() < 0.25, "{error} against {expected}");
         assert_eq!(degrees, 30);
     }
@@ -164,7 +205,7 @@ mod tests {
         samples =
             Samples { starts: (0..=400).map(|e| 3 * e).collect::<Vec<_>>().into(), ..samples_of(&thrice, &thrice) };
         let mean = |rows: &[u32]| rows.iter().map(|&r| samples.x.data[r as usize]).sum::<f64>() / rows.len() as f64;
-        let (error, _) = Part::all(&samples).subsampled_error(1200, 5, &Seeds::new(1), &mean).unwrap();
+        let Subsampled { error, .. } = Part::all(&samples).subsampled_error(1200, 5, &Seeds::new(1), &mean).unwrap();
         assert!((error * 400f64.sqrt() - 1.0).abs() < 0.25, "{error}");
     }
 

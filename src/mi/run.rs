@@ -108,6 +108,7 @@ fn compare(results: &mut [(usize, JobResult)]) {
     let lower = rows()
         .filter(|r| r.kind == Kind::LowerBound && r.unit == Unit::Nats)
         .filter_map(|r| Some((r.interval_low?, r.estimator.clone())))
+        .filter(|(low, _)| *low > 0.0)
         .max_by(|a, b| a.0.total_cmp(&b.0));
     let Some((low, name)) = lower else { return };
     for row in results.iter_mut().flat_map(|r| r.1.rows.iter_mut().flatten()) {

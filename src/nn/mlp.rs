@@ -173,6 +173,34 @@ impl Mlp {
 }
 
 #[cfg(test)]
+impl Mlp {
+    /// The forward pass as candle computes it, whose autograd is the reference of tests; parameters from `at` on.
+    pub(crate) fn by_candle(
+        &self,
+        params: &candle_core::Tensor,
+        mut at: usize,
+        x: &candle_core::Tensor,
+    ) -> candle_core::Tensor {
+        let mut h = x.clone();
+        for layer in 0..self.layers() {
+            let [o, i] = self.weight(layer).0;
+            let weight = params.narrow(0, at, o * i).unwrap().reshape((o, i)).unwrap();
+            let bias = params.narrow(0, at + o * i, o).unwrap();
+            at += o * (i + 1);
+            h = candle_nn::Module::forward(&candle_nn::Linear::new(weight, Some(bias)), &h).unwrap();
+            h = match self.activation(layer) {
+                Activation::Identity => h,
+                Activation::Relu => h.relu().unwrap(),
+                Activation::LeakyRelu => candle_nn::ops::leaky_relu(&h, 0.01).unwrap(),
+                Activation::Tanh => h.tanh().unwrap(),
+                Activation::Sigmoid => candle_nn::ops::sigmoid(&h).unwrap(),
+            };
+        }
+        h
+    }
+}
+
+#[cfg(test)]
 mod tests {
     use candle_core::{D, DType, Device, Tensor, Var};
 
@@ -184,21 +212,7 @@ mod tests {
         let dev = &Device::Cpu;
         let vars = Var::from_tensor(&Tensor::from_slice(params, params.len(), dev).unwrap()).unwrap();
         let x = Var::from_tensor(&Tensor::from_slice(x, (rows, mlp.inputs()), dev).unwrap()).unwrap();
-        let mut h = x.as_tensor().clone();
-        for layer in 0..mlp.layers() {
-            let ([o, i], at) = mlp.weight(layer);
-            let weight = vars.narrow(0, at, o * i).unwrap().reshape((o, i)).unwrap();
-            let bias = vars.narrow(0, at + o * i, o).unwrap();
-            let linear = candle_nn::Linear::new(weight, Some(bias));
-            h = candle_nn::Module::forward(&linear, &h).unwrap();
-            h = match mlp.activation(layer) {
-                Activation::Identity => h,
-                Activation::Relu => h.relu().unwrap(),
-                Activation::LeakyRelu => candle_nn::ops::leaky_relu(&h, 0.01).unwrap(),
-                Activation::Tanh => h.tanh().unwrap(),
-                Activation::Sigmoid => candle_nn::ops::sigmoid(&h).unwrap(),
-            };
-        }
+        let h = mlp.by_candle(&vars, 0, &x);
         let w = Tensor::from_slice(w, (rows, mlp.outputs()), dev).unwrap();
         let loss = (&h * w).unwrap().sum(D::Minus1).unwrap().sum_all().unwrap();
         let grads = loss.backward().unwrap();

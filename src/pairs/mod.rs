@@ -22,6 +22,4 @@ pub use lag::Lagging;
 pub use paths::matching;
 pub use predicate::Predicate;
 pub use store::{Links, links};
-pub use table::{
-    Passed, PieceSize, Progress, Sample, TableOptions, all_pairs, is_store, pass, size, table, tables,
-};
+pub use table::{Passed, PieceSize, Progress, Sample, TableOptions, all_pairs, is_store, pass, size, table, tables};

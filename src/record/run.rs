@@ -2,11 +2,13 @@
 //! A trained team: the actors of a run directory, with or without exploration noise.
 //!
 //! # Definition
-//! a^i = clamp(π^i(o^i, {ι^{ji} o^j}) + noise, low, 1), low −1, or 0 for decoder `mpe2`; noise is none, Gaussian with standard deviation σ, or the
+//! a^i = clamp(π^i(o^i, {ι^{ji} m^j}) + noise, low, 1), low −1, or 0 for decoder `mpe2`; m^j is o^j, or `f_j(o^j)` of a team
+//! trained with `maddpg.messages = "encoder"`. Noise is none, Gaussian with standard deviation σ, or the
 //! Ornstein–Uhlenbeck process x ← x − θ x + σ z of the training loop, times its scale.
 //!
 //! # Shapes and units
-//! One action row per learner, in \[low, 1\]; the message is the sender's observation.
+//! One action row per learner, in \[low, 1\]; one message row per learner: its observation, or what its encoder makes of
+//! it, in \[−1, 1\].
 //!
 //! # Parameters
 //! `path` (the run directory, or an actor file), `action_noise` (σ, default 0).
@@ -27,7 +29,7 @@ use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use super::{Build, Policy, PolicyEpisode, View, Widths, part, part_mut};
-use crate::algo::{Actors, RunPolicyError, Team, TeamScratch};
+use crate::algo::{Actors, EncoderScratch, RunPolicyError, Sight, Team, TeamScratch};
 use crate::registry::{Entry, RegistryError};
 use crate::rng::{self, Seeds, Stream};
 use crate::scenario::{self, Scenario, offsets};
@@ -161,6 +163,14 @@ impl Policy for Trained {
         self.parameters.clone()
     }
 
+    fn message_width(&self, scenario: &dyn Scenario, agent: usize) -> usize {
+        let agents = scenario.agents();
+        if !self.actors.encodes() || !agents[agent].learner {
+            return agents[agent].message;
+        }
+        self.actors.message[agents[..agent].iter().filter(|a| a.learner).count()]
+    }
+
     fn start<'a>(&'a self, scenario: &'a dyn Scenario, seeds: &Seeds) -> Box<dyn PolicyEpisode + 'a> {
         self.start_together(scenario, 0, std::slice::from_ref(seeds))
     }
@@ -172,11 +182,16 @@ impl Policy for Trained {
         nodes: &[Seeds],
     ) -> Box<dyn PolicyEpisode + 'a> {
         let agents = scenario.agents();
-        let learners = |width: fn(&AgentSpec) -> usize| -> Vec<[usize; 2]> {
-            let ends = offsets(agents, width);
+        let learners = |ends: &[usize]| -> Vec<[usize; 2]> {
             (0..agents.len()).filter(|&a| agents[a].learner).map(|a| [ends[a], ends[a + 1]]).collect()
         };
-        let action = learners(|a| a.action);
+        let [observed, acted] = [offsets(agents, |a| a.observation), offsets(agents, |a| a.action)];
+        let mut sent = vec![0];
+        sent.extend(self.message_widths(scenario).iter().scan(0, |end, width| {
+            *end += width;
+            Some(*end)
+        }));
+        let action = learners(&acted);
         let components: usize = action.iter().map(|[from, to]| to - from).sum();
         Box::new(Acting {
             trained: self,
@@ -184,10 +199,13 @@ impl Policy for Trained {
             noise: nodes.iter().map(|seeds| seeds.stream("action-noise")).collect(),
             scale: (0..nodes.len() as u64).map(|i| self.noise.scale(first + i)).collect(),
             process: vec![0.0; nodes.len() * components],
-            observation: learners(|a| a.observation),
+            observation: learners(&observed),
+            message: learners(&sent),
             action,
             scenario,
             rows: Vec::new(),
+            sent: Vec::new(),
+            sending: EncoderScratch::default(),
             scratch: TeamScratch::default(),
         })
     }
@@ -203,31 +221,47 @@ struct Acting<'a> {
     scale: Vec<f64>,
     /// State of the noise `[worlds, components]`.
     process: Vec<f64>,
-    /// Where each learner's observation and action lie in a world's row.
+    /// Where each learner's observation, message and action lie in a world's row.
     observation: Vec<[usize; 2]>,
+    message: Vec<[usize; 2]>,
     action: Vec<[usize; 2]>,
     /// Observations of all learners `[worlds, O]`.
     rows: Vec<f32>,
+    /// Messages of all learners `[worlds, M]`, where encoders make them.
+    sent: Vec<f32>,
+    sending: EncoderScratch,
     scratch: TeamScratch,
 }
 
 impl PolicyEpisode for Acting<'_> {
     fn send(&mut self, observations: &[f32], messages: &mut [f32]) {
-        let w = self.widths;
-        for world in 0..self.noise.len() {
-            let (seen, sent) = (part(observations, w.observations, world), part_mut(messages, w.messages, world));
-            super::send_observations(self.scenario.agents(), seen, sent);
+        let (worlds, w, actors) = (self.noise.len(), self.widths, &self.trained.actors);
+        if !actors.encodes() {
+            for world in 0..worlds {
+                let (seen, sent) = (part(observations, w.observations, world), part_mut(messages, w.messages, world));
+                super::send_observations(self.scenario.agents(), seen, sent);
+            }
+            return;
+        }
+        gather(&self.observation, observations, w.observations, &mut self.rows);
+        self.trained.team.encode(actors, (&self.rows, worlds), &mut self.sending, &mut self.sent);
+        let mut sent = &self.sent[..];
+        for row in messages.chunks_exact_mut(w.messages) {
+            for &[from, to] in &self.message {
+                row[from..to].copy_from_slice(&sent[..to - from]);
+                sent = &sent[to - from..];
+            }
         }
     }
 
     fn act(&mut self, view: &View<'_>, actions: &mut [f32]) {
-        let (worlds, w) = (self.noise.len(), self.widths);
-        self.rows.clear();
-        for world in 0..worlds {
-            let seen = part(view.observations, w.observations, world);
-            self.observation.iter().for_each(|&[from, to]| self.rows.extend_from_slice(&seen[from..to]));
+        let (worlds, w, actors) = (self.noise.len(), self.widths, &self.trained.actors);
+        gather(&self.observation, view.observations, w.observations, &mut self.rows);
+        if actors.encodes() {
+            gather(&self.message, view.messages, w.messages, &mut self.sent);
         }
-        self.trained.team.act(&self.trained.actors, &self.rows, view.link, worlds, &mut self.scratch);
+        let sight = Sight { observations: &self.rows, messages: &self.sent, link: view.link };
+        self.trained.team.act(actors, sight, worlds, &mut self.scratch);
         for (i, &[from, to]) in self.action.iter().enumerate() {
             let chosen = self.scratch.actions(i);
             for (world, action) in chosen.chunks_exact(to - from).enumerate() {
@@ -238,6 +272,16 @@ impl PolicyEpisode for Acting<'_> {
             if self.scale[world] != 0.0 {
                 self.explore(world, part_mut(actions, w.actions, world));
             }
+        }
+    }
+}
+
+/// The learners' columns of each world's row of `from`, which is `width` wide, side by side.
+fn gather(columns: &[[usize; 2]], from: &[f32], width: usize, rows: &mut Vec<f32>) {
+    rows.clear();
+    for row in from.chunks_exact(width.max(1)) {
+        for &[from, to] in columns {
+            rows.extend_from_slice(&row[from..to]);
         }
     }
 }

@@ -77,6 +77,8 @@ pub struct Run {
     pub training: Vec<(i64, f64)>,
     /// Test episodes.
     pub episodes: Vec<TestEpisode>,
+    /// Test episodes of the best team, where the run chose one (protocol `standard`).
+    pub best: Vec<TestEpisode>,
 }
 
 /// One test episode.
@@ -269,6 +271,7 @@ fn read_run(path: &Path) -> Result<Run, ReportError> {
         settings,
         training: Vec::new(),
         episodes: Vec::new(),
+        best: Vec::new(),
     };
     let (metrics, evaluation) = (path.join("metrics.parquet"), path.join("evaluation.parquet"));
     if !metrics.exists() && !evaluation.exists() {
@@ -278,7 +281,15 @@ fn read_run(path: &Path) -> Result<Run, ReportError> {
         guarded(&metrics, || read_training(&metrics, &mut run))?;
     }
     if evaluation.exists() {
-        guarded(&evaluation, || read_evaluation(&evaluation, &mut run))?;
+        run.episodes = guarded(&evaluation, || Ok(read_tests(&evaluation, &mut run)?.1))?;
+    }
+    let standard = path.join("evaluation_standard.parquet");
+    if standard.exists() {
+        run.best = guarded(&standard, || {
+            let (table, episodes) = read_tests(&standard, &mut run)?;
+            let best = table.bits_or_null("best")?;
+            Ok(episodes.into_iter().zip(best).filter(|(_, best)| *best == Some(true)).map(|(e, _)| e).collect())
+        })?;
     }
     Ok(run)
 }
@@ -291,7 +302,8 @@ fn read_training(path: &Path, run: &mut Run) -> Result<(), ReportError> {
     Ok(())
 }
 
-fn read_evaluation(path: &Path, run: &mut Run) -> Result<(), ReportError> {
+/// A table of tests, which must be this run's, and its episodes.
+fn read_tests(path: &Path, run: &mut Run) -> Result<(Columns, Vec<TestEpisode>), ReportError> {
     let table = Columns::open_filled(path)?;
     let differs = |what, config: &str, evaluation: &str| ReportError::Mismatch {
         what,
@@ -317,8 +329,8 @@ fn read_evaluation(path: &Path, run: &mut Run) -> Result<(), ReportError> {
     let (channels, values, losses) = (table.text("channel")?, table.finite("return")?, table.finite("loss_rate")?);
     run.task.agents = agents[0];
     let rows = channels.into_iter().zip(values).zip(losses);
-    run.episodes = rows.map(|((channel, value), loss_rate)| TestEpisode { channel, value, loss_rate }).collect();
-    Ok(())
+    let rows = rows.map(|((channel, value), loss_rate)| TestEpisode { channel, value, loss_rate }).collect();
+    Ok((table, rows))
 }
 
 #[cfg(test)]

@@ -24,7 +24,7 @@ pub struct Published {
 }
 
 /// All published cells, by table, scenario, agents, channel and row of the table.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Tables {
     cells: BTreeMap<(&'static str, &'static str, i64, &'static str, String), Published>,
 }
@@ -254,6 +254,7 @@ pub(super) mod tests {
             settings: BTreeMap::new(),
             training: Vec::new(),
             episodes: Vec::new(),
+            best: Vec::new(),
         }
     }
 

@@ -153,6 +153,7 @@ fn fill(mut output: Output, collected: &Collected, request: &Request<'_>) -> Res
             .map_or_else(|_| "team reward as the run recorded it".to_owned(), |s| s.reward_convention().to_owned());
         let returns = returns::table(&task, &convention, &runs, reference, &published)?;
         sections.push(task_section(&mut output, &task, &runs, returns.as_ref(), reference)?);
+        sections.extend(best_section(&output, &task, &convention, &runs)?);
         tables.extend(returns);
     }
     for (index, file) in collected.mutual.iter().enumerate() {
@@ -266,7 +267,9 @@ fn task_section(
         notes: Vec::new(),
     };
     let Some(returns) = returns else {
-        section.notes.push("No run of this task has been evaluated: run `ccmarl evaluate`.".to_owned());
+        if runs.iter().all(|r| r.best.is_empty()) {
+            section.notes.push("No run of this task has been evaluated: run `ccmarl evaluate`.".to_owned());
+        }
         return Ok(section);
     };
     let data = Data {
@@ -283,6 +286,27 @@ fn task_section(
     output.text(&section.files[0], &document(returns))?;
     output.text(&section.files[1], &tidy_csv(&returns.tidy()))?;
     Ok(section)
+}
+
+/// The best teams of runs that chose one, in a table of their own: chosen teams stand beside no last ones.
+fn best_section(output: &Output, task: &Task, convention: &str, runs: &[&Run]) -> Result<Option<Section>, ReportError> {
+    let chosen = runs.iter().filter(|r| !r.best.is_empty());
+    let best: Vec<Run> = chosen.map(|r| Run { episodes: r.best.clone(), ..(*r).clone() }).collect();
+    let best: Vec<&Run> = best.iter().collect();
+    let Some(mut returns) = returns::table(task, convention, &best, None, &Tables::default())? else { return Ok(None) };
+    returns.notes.insert(
+        0,
+        "Of each run the best team, by its tests over the link that it trained over (channel prior), tested again on other \
+         episodes. The table of last teams is another."
+            .to_owned(),
+    );
+    let id = slug(&format!("{}-{}-{}-best", task.scenario, task.agents, task.profile));
+    let files = vec![format!("tables/{id}-returns.md"), format!("tables/{id}-returns.csv")];
+    output.text(&files[0], &document(&returns))?;
+    output.text(&files[1], &tidy_csv(&returns.tidy()))?;
+    let (caption, table) = (caption(&returns), Some(grid(&returns)));
+    let title = format!("{task}: best teams");
+    Ok(Some(Section { id, title, pictures: Vec::new(), caption, table, files, notes: returns.notes }))
 }
 
 /// What the whiskers are; a comparison is promised only over seeds.

@@ -1,20 +1,15 @@
 //! A training run's configuration: the TOML a user writes, checked and with every default filled in.
 
-use std::path::Path;
-
 use serde::{Deserialize, Serialize};
 
 use super::TrainError;
 use super::protocol::EvaluationConfig;
-use crate::algo::{self, MaddpgConfig};
-use crate::registry::{RegistryError, Spec};
+use crate::algo::{self, MaddpgConfig, Messages};
+use crate::registry::Spec;
 use crate::scenario::Scenario;
 
 /// Most hidden layers, and most units in one: what fits in memory many times over.
 const WIDEST: [usize; 2] = [16, 4096];
-
-/// Largest configuration file that is read, bytes.
-const LIMIT: u64 = 1 << 20;
 
 /// Everything a training run depends on. `config.toml` in the run directory is this, fully resolved.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -266,40 +261,6 @@ impl TrainConfig {
         }
     }
 
-    /// Reads a TOML file; a typo is refused with its line, in the tables of plugins too.
-    ///
-    /// # Errors
-    /// [`TrainError::Io`], [`TrainError::Config`].
-    pub fn read(path: &Path) -> Result<Self, TrainError> {
-        let (config, text) = Self::parse(path)?;
-        let refuse = |message: String| TrainError::Config { message, path: path.to_owned() };
-        // a plugin's parameters are its own: what it refuses has no place in the file until it is looked for
-        config.check_plugins().map_err(|error| match line_of(&text, &error.to_string()) {
-            Some(line) => refuse(format!("line {line}: {error}")),
-            None => refuse(error.to_string()),
-        })?;
-        Ok(config)
-    }
-
-    /// Reads a run's own file and its text, without building its scenario and prior: what those need (the trace of a
-    /// prior) may be gone when the run itself is still good.
-    ///
-    /// # Errors
-    /// As [`TrainConfig::read`].
-    pub fn parse(path: &Path) -> Result<(Self, String), TrainError> {
-        let text = crate::io::read_text(path, LIMIT)?;
-        let config = toml::from_str(&text).map_err(|e| TrainError::Config {
-            message: e.to_string().trim().replace('\n', "; "),
-            path: path.to_owned(),
-        })?;
-        Ok((config, text))
-    }
-
-    fn check_plugins(&self) -> Result<(), RegistryError> {
-        let scenario = crate::scenario::build(&self.scenario)?;
-        self.prior.as_ref().map_or(Ok(()), |prior| crate::record::build_link(prior, scenario.as_ref()).map(|_| ()))
-    }
-
     /// Fills in what preset and scenario decide, and checks every range.
     ///
     /// # Errors
@@ -343,8 +304,30 @@ impl TrainConfig {
         let between = self.update_every / (scenario.steps() as u64).max(1);
         self.envs.get_or_insert(between.clamp(1, 64) as usize);
         self.evaluation.episodes = Some(self.evaluation.episodes());
+        self.resolve_encoders(learners)?;
         self.check()?;
         Ok(self)
+    }
+
+    /// Fills in the shape of the encoders, or refuses one where there are none.
+    fn resolve_encoders(&mut self, learners: usize) -> Result<(), TrainError> {
+        let m = &mut self.maddpg;
+        let fail = |name: &str, message: String| Err(TrainError::Value { name: format!("maddpg.{name}"), message });
+        if m.messages == Messages::Encoder {
+            if learners < 2 {
+                let message =
+                    format!("an encoder learns through who hears it, found {learners} learner: set \"observation\"");
+                return fail("messages", message);
+            }
+            m.message_width.get_or_insert(MaddpgConfig::MESSAGE_WIDTH);
+            m.encoder_hidden.get_or_insert_with(|| MaddpgConfig::ENCODER_HIDDEN.to_vec());
+            return Ok(());
+        }
+        let shapes = [("message_width", m.message_width.is_some()), ("encoder_hidden", m.encoder_hidden.is_some())];
+        match shapes.into_iter().find(|(_, given)| *given) {
+            None => Ok(()),
+            Some((name, _)) => fail(name, "it shapes encoders: set messages = \"encoder\", or leave it out".to_owned()),
+        }
     }
 
     /// Worlds stepped together; 1 before [`TrainConfig::resolve`] where not given.
@@ -371,7 +354,17 @@ impl TrainConfig {
             (name, value >= 0.0 && value.is_finite(), format!("expected a number ≥ 0, found {value}"))
         };
         let [alpha, beta] = self.weights();
+        let layers = |name: &'static str, widths: &[usize]| {
+            let fits = widths.len() <= WIDEST[0] && widths.iter().all(|w| (1..=WIDEST[1]).contains(w));
+            (name, fits, format!("expected at most {} layers of 1 to {} units, found {widths:?}", WIDEST[0], WIDEST[1]))
+        };
         let rules = [
+            layers("maddpg.encoder_hidden", m.encoder_hidden.as_deref().unwrap_or(&[])),
+            (
+                "maddpg.message_width",
+                m.message_width.is_none_or(|w| (1..=WIDEST[1]).contains(&w)),
+                format!("expected 1 to {}, found {}", WIDEST[1], m.message_width.unwrap_or(0)),
+            ),
             positive("steps", self.steps as usize),
             positive("replay", self.replay),
             positive("update_every", self.update_every as usize),
@@ -382,11 +375,7 @@ impl TrainConfig {
             positive("evaluation.episodes", self.evaluation.episodes() as usize),
             positive("maddpg.batch", m.batch.unwrap_or(0)),
             positive("maddpg.hidden", m.hidden.iter().copied().min().unwrap_or(0)),
-            (
-                "maddpg.hidden",
-                m.hidden.len() <= WIDEST[0] && m.hidden.iter().all(|&w| w <= WIDEST[1]),
-                format!("expected at most {} layers of at most {} units, found {:?}", WIDEST[0], WIDEST[1], m.hidden),
-            ),
+            layers("maddpg.hidden", &m.hidden),
             unit("maddpg.gamma", m.gamma),
             unit("maddpg.tau", m.tau),
             rate("maddpg.actor_learning_rate", m.actor_learning_rate),
@@ -422,25 +411,6 @@ impl TrainConfig {
     pub fn to_toml(&self) -> Result<String, TrainError> {
         toml::to_string(self).map_err(|e| TrainError::Value { name: "config".to_owned(), message: e.to_string() })
     }
-}
-
-/// The first line of `text` that gives a value to a name which `error` quotes: a key or a plugin.
-fn line_of(text: &str, error: &str) -> Option<usize> {
-    let quoted: Vec<&str> = error.split(['`', '"']).skip(1).step_by(2).collect();
-    // "simple_spread: agents: …" quotes nothing: the words before colons are names too
-    let words = error.split(": ").map(|word| word.split(' ').next().unwrap_or(word));
-    let names = quoted.into_iter().chain(words);
-    let gives = |line: &str, name: &str| {
-        let code = line.split('#').next().unwrap_or(line);
-        code.match_indices(name).any(|(at, _)| {
-            let whole = |c: Option<char>| c.is_none_or(|c| !c.is_alphanumeric() && c != '_' && c != '-');
-            whole(code[..at].chars().next_back()) && whole(code[at + name.len()..].chars().next())
-        })
-    };
-    names
-        .filter(|name| !name.is_empty())
-        .find_map(|name| text.lines().position(|line| gives(line, name)))
-        .map(|line| line + 1)
 }
 
 /// A plugin's resolved parameters, which carry its name, as a spec.

@@ -16,11 +16,13 @@ const RUN_FILES: [&str; 8] = [
     "timings.parquet",
     EVALUATION_FILE,
     STANDARD_FILE,
-    "mi.parquet",
+    MUTUAL,
     "events.out.tfevents.ccmarl",
     CHECKPOINTS,
 ];
 
+/// Estimates of what the team's messages tell, where somebody put them beside its tables.
+const MUTUAL: &str = "mi.parquet";
 /// The configuration, fully resolved; says that a directory is a run.
 pub(super) const CONFIG: &str = "config.toml";
 pub(super) const CHECKPOINTS: &str = "checkpoint";
@@ -45,19 +47,29 @@ pub(super) fn refuse_foreign(dir: &Path, force: bool) -> Result<(), TrainError> 
     Ok(())
 }
 
+/// A directory that is held. It is let go in so many words: closing would not do while a process that was just forked
+/// has the file too.
+pub(super) struct Held(File);
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        self.0.unlock().ok(); // what fails ends with the process
+    }
+}
+
 /// Holds a directory for this process, if it is there: two that train into one would undo each other's work. The
 /// operating system lets go when the process ends, so no lock is ever stale; where it has no locks there is only the name.
-pub(super) fn hold(dir: &Path) -> Result<Option<File>, TrainError> {
+pub(super) fn hold(dir: &Path) -> Result<Option<Held>, TrainError> {
     let Ok(file) = File::open(dir) else { return Ok(None) };
     match file.try_lock() {
         Err(TryLockError::WouldBlock) => Err(TrainError::Busy(dir.to_owned())),
-        Ok(()) | Err(TryLockError::Error(_)) => Ok(Some(file)),
+        Ok(()) | Err(TryLockError::Error(_)) => Ok(Some(Held(file))),
     }
 }
 
 /// Makes the directory of a run that has not taken a step: with its configuration and first checkpoint it appears under
 /// its name, and only then is what was there gone. It is held from its first file on; the lock goes with the rename.
-pub(super) fn create(trainer: &mut Trainer, force: bool) -> Result<Option<File>, TrainError> {
+pub(super) fn create(trainer: &mut Trainer, force: bool) -> Result<Option<Held>, TrainError> {
     let dir = trainer.dir.clone();
     let partial = io::partial_path(&dir);
     drop(hold(&partial)?); // a living writer's partial is not removed
@@ -89,13 +101,13 @@ pub(super) fn remove_leftovers(dir: &Path) -> Result<(), TrainError> {
     Ok(())
 }
 
-/// Removes the tests of a run that is about to go on: they are of the team that it had. Returns their names.
+/// Removes tests and estimates of a run that is about to go on: they are of the team that it had. Returns their names.
 pub(super) fn remove_tests(trainer: &Trainer) -> Result<Vec<&'static str>, TrainError> {
     if trainer.tests.best.params.is_empty() {
         io::remove(&trainer.dir.join(CHECKPOINTS).join(checkpoint::BEST))?; // otherwise the next checkpoint's is its
     }
     let there = |name: &&str| trainer.dir.join(name).exists();
-    let names: Vec<_> = [EVALUATION_FILE, STANDARD_FILE].into_iter().filter(there).collect();
+    let names: Vec<_> = [EVALUATION_FILE, STANDARD_FILE, MUTUAL].into_iter().filter(there).collect();
     names.iter().try_for_each(|name| io::remove(&trainer.dir.join(name)))?;
     Ok(names)
 }
@@ -120,6 +132,17 @@ fn names(dir: &Path) -> Result<Vec<String>, TrainError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_directory_is_let_go_though_a_forked_process_has_its_file_too() {
+        let dir = tempfile::tempdir().unwrap();
+        let held = hold(dir.path()).unwrap().unwrap();
+        assert!(matches!(hold(dir.path()), Err(TrainError::Busy(_))));
+        let forked = held.0.try_clone().unwrap();
+        drop(held);
+        assert!(hold(dir.path()).unwrap().is_some());
+        drop(forked);
+    }
 
     #[test]
     fn leftovers_are_told_from_what_somebody_put_there() {

@@ -5,12 +5,15 @@
 //! JSD (lower bound) learns from delivered pairs, CLUB (upper bound) from lost ones; both are shared over all ordered
 //! links, or each link has its own. Values are per sample; negatives are cyclic shifts of the action at fixed message,
 //! so none is its own partner, or all actions of the minibatch.
+//!
+//! Where encoders make the messages, rings hold what was sent at rollout, as does shaping at rollout; what is computed
+//! from replay (shaping on a minibatch, pairs from replay) sees what the encoders of now would send.
 
 use super::TrainError;
 use super::config::{DumieConfig, Estimators, LostMessage, PairSource, Shaping};
 use super::estimator::{Class, Estimator, Nets, Pairs, Place};
 use super::replay::Replay;
-use crate::algo::Batch;
+use crate::algo::{Batch, Maddpg};
 use crate::rng::{self, Seeds, Stream};
 use crate::schema::{Episode, Layout};
 
@@ -36,8 +39,8 @@ pub struct Dumie {
     config: DumieConfig,
     weights: [f64; 2],
     learners: Vec<usize>,
-    /// Where each learner's observation and action lie in a transition.
-    observation: Vec<Place>,
+    /// Where each learner's message and action lie in a transition.
+    message: Vec<Place>,
     action: Vec<Place>,
     nets: Nets,
     /// JSD over delivered pairs: one, or one per ordered link.
@@ -46,6 +49,9 @@ pub struct Dumie {
     pub club: Vec<Estimator>,
     /// A minibatch's pairs, by class and estimator.
     pairs: [Vec<Pairs>; 2],
+    /// Of pairs from replay, all observations and what encoders make of them.
+    seen: Vec<f32>,
+    sent: Vec<f32>,
 }
 
 impl Dumie {
@@ -64,9 +70,9 @@ impl Dumie {
             };
             learners.iter().map(place).collect()
         };
-        let (observation, action) = (places(|a| a.observation), places(|a| a.action));
+        let (message, action) = (places(|a| a.message), places(|a| a.action));
         let widest = |places: &[Place]| places.iter().map(|p| p[1]).max().unwrap_or(1).max(1);
-        let widths = [widest(&observation), widest(&action)];
+        let widths = [widest(&message), widest(&action)];
         let links = learners.len() * learners.len().saturating_sub(1);
         let nets = Nets::new(widths, config.negatives, links);
         let count = if config.estimators == Estimators::Shared { 1 } else { links };
@@ -85,7 +91,8 @@ impl Dumie {
         }
         let [jsd, club] = made;
         let pairs = [(); 2].map(|()| (0..count).map(|_| Pairs::default()).collect());
-        Ok(Self { config, weights, learners, observation, action, nets, jsd, club, pairs })
+        let [seen, sent] = [Vec::new(), Vec::new()];
+        Ok(Self { config, weights, learners, message, action, nets, jsd, club, pairs, seen, sent })
     }
 
     /// Every estimator with its name: `jsd`, `club`, or with the link's number behind it (sender by receiver).
@@ -125,13 +132,15 @@ impl Dumie {
     }
 
     /// k steps of each estimator whose ring is full enough, and what they report. With a stream for them, held-out
-    /// values come first, from the pairs observed since the last call; they change nothing else.
+    /// values come first, from the pairs observed since the last call; they change nothing else. `encoder` is whose
+    /// encoders make the messages, `None` where a message is the observation.
     ///
     /// # Errors
     /// [`TrainError::Nn`].
     pub fn train(
         &mut self,
         replay: &Replay,
+        mut encoder: Option<&mut Maddpg>,
         rng: &mut Stream,
         heldout: Option<&mut Stream>,
     ) -> Result<DumieMetrics, TrainError> {
@@ -148,7 +157,7 @@ impl Dumie {
         for step in 0..self.config.k {
             for (at, class) in [(0, Class::Delivered), (2, Class::Lost)] {
                 for index in 0..self.jsd.len() {
-                    let value = self.learn(class, index, replay, rng)?;
+                    let value = self.learn((class, index), replay, encoder.as_deref_mut(), rng)?;
                     // what is reported is the last step's
                     value.into_iter().filter(|_| step + 1 == self.config.k).for_each(|value| count(at, value));
                 }
@@ -162,9 +171,9 @@ impl Dumie {
     /// One step of one estimator, when it has pairs enough.
     fn learn(
         &mut self,
-        class: Class,
-        index: usize,
+        (class, index): (Class, usize),
         replay: &Replay,
+        encoder: Option<&mut Maddpg>,
         rng: &mut Stream,
     ) -> Result<Option<f64>, TrainError> {
         let estimators = if class == Class::Delivered { &mut self.jsd } else { &mut self.club };
@@ -176,30 +185,55 @@ impl Dumie {
             return self.nets.learn(class, estimator, self.config.batch, rng).map(Some);
         }
         let mut pairs = std::mem::take(&mut self.pairs[0][index]);
-        let found = self.filter(class, index, replay, rng, &mut pairs);
+        let mut seen = encoder.is_some().then(|| std::mem::take(&mut self.seen));
+        let found = self.filter((class, index), replay, rng, &mut pairs, seen.as_mut());
+        let messages = match (encoder, seen) {
+            (Some(learner), Some(seen)) => {
+                learner.encode(&seen, pairs.len(), &mut self.sent);
+                self.seen = seen;
+                &self.sent
+            }
+            _ => &replay.observations,
+        };
         let estimators = if class == Class::Delivered { &mut self.jsd } else { &mut self.club };
         let Estimator { params, adam, .. } = &mut estimators[index];
-        let data = [&replay.observations[..], &replay.actions];
+        let data = [&messages[..], &replay.actions];
         let value = if found { Some(self.nets.step(class, params, adam, &pairs, data, rng)?) } else { None };
         self.pairs[0][index] = pairs;
         Ok(value)
     }
 
-    /// Draws pairs of one class from all of replay; false when it hardly has any.
-    fn filter(&self, class: Class, index: usize, replay: &Replay, rng: &mut Stream, pairs: &mut Pairs) -> bool {
+    /// Draws pairs of one class from all of replay; false when it hardly has any. Messages lie in replay's observations,
+    /// or with `seen`, which takes all observations of each pair, in what encoders make of those.
+    fn filter(
+        &self,
+        (class, index): (Class, usize),
+        replay: &Replay,
+        rng: &mut Stream,
+        pairs: &mut Pairs,
+        mut seen: Option<&mut Vec<f32>>,
+    ) -> bool {
         let n = self.learners.len();
+        let sent: usize = self.message.iter().map(|p| p[1]).sum();
         pairs.clear();
         pairs.reserve(self.config.batch);
+        if let Some(seen) = &mut seen {
+            seen.clear();
+        }
         for _ in 0..TRIES * self.config.batch {
             let transition = rng::below(rng, replay.len());
             let of = if self.jsd.len() == 1 { rng::below(rng, n * (n - 1)) } else { index };
             let (j, i) = (of / (n - 1), of % (n - 1));
             let i = i + usize::from(i >= j);
-            let [observation, action, bits] = replay.places(transition);
+            let [observed, action, bits] = replay.places(transition);
             let delivered = replay.link[bits + j * n + i];
             if delivered == (class == Class::Delivered) {
+                let row = seen.as_mut().map_or(observed, |seen| {
+                    seen.extend_from_slice(replay.observed(transition));
+                    pairs.len() * sent
+                });
                 let [message, to] = self.pair(delivered, j, i);
-                pairs.push([observation + message[0], message[1]], [action + to[0], to[1]], 0);
+                pairs.push([row + message[0], message[1]], [action + to[0], to[1]], 0);
                 if pairs.len() == self.config.batch {
                     return true;
                 }
@@ -210,7 +244,7 @@ impl Dumie {
 
     /// Where message j → i and action i lie in a transition.
     fn pair(&self, delivered: bool, j: usize, i: usize) -> [Place; 2] {
-        let [start, width] = self.observation[j];
+        let [start, width] = self.message[j];
         let zero = !delivered && self.config.lost_message == LostMessage::Zero;
         [[start, if zero { 0 } else { width }], self.action[i]]
     }
@@ -224,7 +258,7 @@ impl Dumie {
     pub fn bonus(&mut self, batch: &Batch, rng: &mut Stream, bonus: &mut Vec<f32>) {
         let n = self.learners.len();
         let width = |places: &[Place]| places.iter().map(|p| p[1]).sum::<usize>();
-        let (o, a) = (width(&self.observation), width(&self.action));
+        let (m, a) = (width(&self.message), width(&self.action));
         let mut classes = std::mem::take(&mut self.pairs);
         for pairs in classes.iter_mut().flatten() {
             pairs.clear();
@@ -236,7 +270,7 @@ impl Dumie {
                     let delivered = bits[j * n + i];
                     let [message, action] = self.pair(delivered, j, i);
                     let pairs = &mut classes[usize::from(!delivered)][self.estimator(j, i)];
-                    pairs.push([row * o + message[0], message[1]], [row * a + action[0], action[1]], row);
+                    pairs.push([row * m + message[0], message[1]], [row * a + action[0], action[1]], row);
                 }
             }
         }
@@ -252,7 +286,7 @@ impl Dumie {
                 if weight == 0.0 || !learned || pairs.len() < 2 {
                     continue;
                 }
-                self.nets.evaluate(class, estimator, pairs, [&batch.observations, &batch.actions], rng);
+                self.nets.evaluate(class, estimator, pairs, [batch.sent(), &batch.actions], rng);
                 for (&row, value) in pairs.rows.iter().zip(&self.nets.values) {
                     bonus[row as usize] += weight as f32 * (value - shift);
                 }
@@ -270,7 +304,7 @@ impl Dumie {
             let (mut batch, links) = (Batch { rows: episode.steps, ..Batch::default() }, self.learners.len().pow(2));
             for &row in &order {
                 for &agent in &self.learners {
-                    batch.observations.extend_from_slice(episode.observations[agent].row(row));
+                    batch.messages.extend_from_slice(episode.messages[agent].row(row));
                     batch.actions.extend_from_slice(episode.actions[agent].row(row));
                 }
                 batch.link.extend_from_slice(&episode.link[row * links..(row + 1) * links]);
@@ -292,6 +326,8 @@ fn link(n: usize, j: usize, i: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::algo::{MaddpgConfig, Messages};
+    use crate::nn::{Activation, Tape};
     use crate::schema::{AgentSpec, Controller, Matrix};
     use crate::train::config::Negatives;
 
@@ -344,7 +380,7 @@ mod tests {
             dumie.observe(&episode(index));
         }
         for index in 0..300 {
-            dumie.train(&replay, &mut Seeds::new(2).indexed_stream("t", index), None).unwrap();
+            dumie.train(&replay, None, &mut Seeds::new(2).indexed_stream("t", index), None).unwrap();
         }
         dumie.observe(&episode(1000));
         (dumie, replay)
@@ -368,7 +404,7 @@ mod tests {
             let (mut dumie, replay) = trained_as(config, [0.01, 0.01]);
             assert_eq!(dumie.named().count(), estimators);
             let mut heldout = Seeds::new(2).stream("held");
-            let metrics = dumie.train(&replay, &mut Seeds::new(2).stream("last"), Some(&mut heldout)).unwrap();
+            let metrics = dumie.train(&replay, None, &mut Seeds::new(2).stream("last"), Some(&mut heldout)).unwrap();
             for jsd in [metrics.jsd, metrics.jsd_heldout] {
                 assert!(jsd.unwrap() > 0.1, "{metrics:?} {:?}", dumie.config);
             }
@@ -397,7 +433,7 @@ mod tests {
     fn pairs_from_replay_are_those_of_the_class_and_a_class_that_is_absent_teaches_nothing() {
         let (mut dumie, replay) = trained_as(DumieConfig { pairs: PairSource::Replay, ..config() }, [1.0, 1.0]);
         let (mut pairs, mut rng) = (Pairs::default(), Seeds::new(3).stream("f"));
-        assert!(dumie.filter(Class::Delivered, 0, &replay, &mut rng, &mut pairs));
+        assert!(dumie.filter((Class::Delivered, 0), &replay, &mut rng, &mut pairs, None));
         assert_eq!(pairs.len(), 256);
         let [x, y] = pairs.of([&replay.observations, &replay.actions]);
         // on delivered links the receiver does what it heard
@@ -405,9 +441,35 @@ mod tests {
         let mut lossless = replay.clone();
         lossless.link.fill(true);
         let before = dumie.club[0].params.read().to_vec();
-        let metrics = dumie.train(&lossless, &mut rng, None).unwrap();
+        let metrics = dumie.train(&lossless, None, &mut rng, None).unwrap();
         assert!(metrics.jsd.is_some() && metrics.club.is_none(), "{metrics:?}");
         assert_eq!(before, *dumie.club[0].params.read());
+    }
+
+    #[test]
+    fn pairs_from_replay_hold_what_the_encoder_of_the_sender_makes_of_what_it_saw() {
+        let mut layout = layout();
+        let encoder = MaddpgConfig { messages: Messages::Encoder, message_width: Some(3), ..MaddpgConfig::default() };
+        let agents: Vec<&AgentSpec> = layout.agents.iter().collect();
+        let mut learner = Maddpg::new(&agents, Activation::Tanh, encoder, &Seeds::new(1)).unwrap();
+        layout.agents.iter_mut().for_each(|agent| agent.message = 3);
+        let config = DumieConfig { pairs: PairSource::Replay, ..config() };
+        let dumie = Dumie::new(&layout, config, [1.0, 1.0], &Seeds::new(1)).unwrap();
+        let (replay, mut rng, mut pairs) = (replay(20), Seeds::new(3).stream("f"), Pairs::default());
+        let (mut seen, mut sent, mut tape) = (Vec::new(), Vec::new(), Tape::default());
+        assert!(dumie.filter((Class::Delivered, 0), &replay, &mut rng, &mut pairs, Some(&mut seen)));
+        learner.encode(&seen, pairs.len(), &mut sent);
+        let [x, y] = pairs.of([&sent, &replay.actions]);
+        let (actors, params) = (&learner.actors, learner.params.actors.read());
+        for pair in 0..256 {
+            let (start, width) = (x.starts[pair] as usize, x.widths[pair]);
+            let sender = start % 6 / 3;
+            let heard = seen[2 * pair + sender];
+            assert_eq!((start, width), (6 * pair + 3 * sender, 3));
+            assert_eq!(y.data[y.starts[pair] as usize], heard, "on delivered links the receiver does what it heard");
+            let exact = actors.encoders[sender].forward(&params[actors.encoder_range(sender)], &[heard], 1, &mut tape);
+            assert!(exact.iter().zip(&sent[start..]).all(|(a, b)| (a - b).abs() < 1e-6));
+        }
     }
 
     #[test]
@@ -427,6 +489,11 @@ mod tests {
         let [one, two] = [bonus([1.0, 0.0], true), bonus([2.0, 5.0], true)];
         assert!(one.iter().all(|&b| b != 0.0) && one.iter().zip(&two).all(|(a, b)| (2.0 * a - b).abs() < 1e-5));
         assert_eq!(bonus([1.0, 0.0], false), [0.0, 0.0]);
+        // what encoders sent stands in for the observations
+        let sent = Batch { observations: vec![9.0; 4], messages: row(true).observations, ..row(true) };
+        let mut encoded = Vec::new();
+        trained([1.0, 0.0]).bonus(&sent, &mut Seeds::new(5).stream("b"), &mut encoded);
+        assert_eq!(encoded, one);
         let [one, two] = [bonus([0.0, 1.0], false), bonus([9.0, 2.0], false)];
         assert!(one.iter().all(|&b| b != 0.0) && one.iter().zip(&two).all(|(a, b)| (2.0 * a - b).abs() < 1e-5));
     }
@@ -451,7 +518,7 @@ mod tests {
         // b hears and does 1, −1, 1, …: a shift in time would give equal steps equal negatives
         let sign = |t: usize| if t.is_multiple_of(2) { 1.0 } else { -1.0 };
         let mut e = Episode { steps: 24, link: [true, true, false, true].repeat(25), ..Episode::default() };
-        e.observations = vec![Matrix { data: (0..25).map(sign).collect(), width: 1 }; 2];
+        e.messages = vec![Matrix { data: (0..25).map(sign).collect(), width: 1 }; 2];
         e.actions = vec![Matrix { data: (0..24).map(sign).collect(), width: 1 }; 2];
         for stream in 0..5 {
             let bonus = dumie.bonus_at_rollout(&e, &mut Seeds::new(6).indexed_stream("b", stream));

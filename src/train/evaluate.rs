@@ -10,6 +10,7 @@ use crate::link;
 use crate::record::{self, Policy, Recording, returns};
 use crate::rng::Seeds;
 use crate::scenario::Scenario;
+use crate::stats::{mean, sd};
 
 /// File of the tests that `ccmarl evaluate` and protocol `paper` make.
 pub(super) const EVALUATION_FILE: &str = "evaluation.parquet";
@@ -29,6 +30,38 @@ pub struct EvaluationRow {
     pub episode_return: f64,
     /// Realised share of lost messages.
     pub loss_rate: f64,
+}
+
+/// What the test episodes on one channel say.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub struct ChannelSummary {
+    /// Channel id.
+    pub channel: String,
+    /// Mean return.
+    pub return_mean: f64,
+    /// Standard deviation of the return over episodes.
+    pub return_std: f64,
+    /// Mean share of lost messages.
+    pub loss_rate: f64,
+    /// Episodes.
+    pub episodes: usize,
+}
+
+/// One line per channel, in the order in which they were tested.
+pub fn summarise(rows: &[EvaluationRow]) -> Vec<ChannelSummary> {
+    let same = rows.chunk_by(|a, b| a.channel == b.channel);
+    same.map(|rows| {
+        let of = |value: fn(&EvaluationRow) -> f64| rows.iter().map(value).collect::<Vec<f64>>();
+        let returns = of(|r| r.episode_return);
+        ChannelSummary {
+            channel: rows[0].channel.clone(),
+            return_mean: mean(&returns),
+            return_std: sd(&returns),
+            loss_rate: mean(&of(|r| r.loss_rate)),
+            episodes: rows.len(),
+        }
+    })
+    .collect()
 }
 
 /// The seed of a run's test episodes: a tree of its own, so that tests disturb no training. All policies of one seed

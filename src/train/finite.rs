@@ -3,8 +3,8 @@
 use super::Trainer;
 use crate::nn::{Adam, Mlp};
 
-/// The first tensor that holds a number that is not finite: the minibatch, which would be the cause, then networks,
-/// targets, optimisers and estimators.
+/// The first tensor that holds a number that is not finite: the minibatch, which would be the cause, then networks
+/// (actors before their encoders), targets, optimisers and estimators.
 pub(super) fn first_not_finite(trainer: &Trainer) -> Option<String> {
     let fault = |values: &[f32]| values.iter().position(|v| !v.is_finite());
     let whole = |name: &str, values: &[f32]| fault(values).map(|_| name.to_owned());
@@ -22,15 +22,20 @@ pub(super) fn first_not_finite(trainer: &Trainer) -> Option<String> {
     let learner = &trainer.learner;
     let actors = |prefix: &str, params: &[f32]| -> Option<String> {
         let actors = &learner.actors;
-        let i = (0..actors.len()).find(|&i| fault(actors.slice(params, i)).is_some())?;
-        layer_of(&format!("{prefix}.{}", actors.names[i]), &actors.networks[i], actors.slice(params, i))
+        let network = |kind: &str, i: usize, network, own| {
+            layer_of(&format!("{prefix}{kind}.{}", actors.names[i]), network, &params[own])
+        };
+        let actor = |(i, shape)| network("actor", i, shape, actors.range(i));
+        let encoder = |(j, shape)| network("encoder", j, shape, actors.encoder_range(j));
+        let found = actors.networks.iter().enumerate().find_map(actor);
+        found.or_else(|| actors.encoders.iter().enumerate().find_map(encoder))
     };
     let params = &learner.params;
     let adam = |name: &str, adam: &Adam| fault(&adam.m).or(fault(&adam.v)).map(|_| name.to_owned());
     layer_of("critic", &learner.critic, &params.critic.read())
-        .or_else(|| actors("actor", &params.actors.read()))
+        .or_else(|| actors("", &params.actors.read()))
         .or_else(|| layer_of("target_critic", &learner.critic, &params.target_critic.read()))
-        .or_else(|| actors("target_actor", &params.target_actors.read()))
+        .or_else(|| actors("target_", &params.target_actors.read()))
         .or_else(|| adam("critic_adam", &learner.critic_adam))
         .or_else(|| adam("actor_adam", &learner.actor_adam))
         .or_else(|| {

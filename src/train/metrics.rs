@@ -7,13 +7,14 @@ use polars::prelude::{Column, DataFrame, ParquetWriter};
 use super::{TrainError, tensorboard};
 
 /// The nullable columns of `metrics.parquet`, in order, each with what it says.
-pub const METRIC_COLUMNS: [(&str, &str); 15] = [
+pub const METRIC_COLUMNS: [(&str, &str); 16] = [
     ("return_mean", "mean return of the training episodes since the last row, with exploration noise"),
     ("td_loss", "mean squared TD error of the minibatches, before each step"),
     ("actor_objective", "mean Q(o, π(o, M)), which the actors climb"),
     ("q_mean", "mean Q(o, a) of the minibatches"),
     ("critic_grad_norm", "mean L2 norm of the critic's gradient before clipping"),
     ("actor_grad_norm", "mean of the largest actor gradient norm before clipping"),
+    ("encoder_grad_norm", "mean of the largest message encoder's gradient norm before clipping"),
     ("jsd", "JSD value of the estimator's minibatches (shifted scale unless configured), not nats"),
     ("jsd_heldout", "JSD value of pairs that the critic had not learned from"),
     ("club", "CLUB value of the estimator's minibatches, nats"),

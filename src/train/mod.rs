@@ -3,6 +3,7 @@
 mod arrays;
 mod checkpoint;
 pub mod config;
+mod config_file;
 mod difference;
 mod directory;
 pub mod dumie;
@@ -21,10 +22,13 @@ mod warm;
 use std::path::PathBuf;
 
 pub use config::TrainConfig;
+pub use config_file::Given;
 pub use estimator::Estimator;
-pub use evaluate::{EVALUATION_COLUMNS, EvaluationRow, evaluate, evaluation_seed, write_evaluation};
+pub use evaluate::{
+    ChannelSummary, EVALUATION_COLUMNS, EvaluationRow, evaluate, evaluation_seed, summarise, write_evaluation,
+};
 pub use metrics::{METRIC_COLUMNS, METRIC_KEYS, MetricsRow};
-pub use protocol::{EvaluationConfig, Protocol, STANDARD_COLUMNS};
+pub use protocol::{EvaluationConfig, LastTest, Protocol, STANDARD_COLUMNS};
 pub use run::{Options, Progress, Report, train};
 pub use timings::TIMING_COLUMNS;
 pub use trainer::Trainer;
@@ -55,6 +59,8 @@ pub enum TrainError {
     Config {
         /// What is wrong, with line and column.
         message: String,
+        /// The line of the file and a mark below it, on lines of their own; empty where the place is not known.
+        excerpt: String,
         /// Where.
         path: PathBuf,
     },

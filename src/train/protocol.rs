@@ -9,7 +9,7 @@
 use polars::prelude::Column;
 use serde::{Deserialize, Serialize};
 
-use super::evaluate::{EvaluationRow, columns, evaluate, evaluation_seed, write_evaluation};
+use super::evaluate::{ChannelSummary, EvaluationRow, columns, evaluate, evaluation_seed, summarise, write_evaluation};
 use super::{TrainError, Trainer, checkpoint, metrics};
 use crate::link::{Channel, suite};
 use crate::record::{ActionNoise, Trained};
@@ -106,6 +106,15 @@ pub(super) struct Best {
     pub(super) step: u64,
 }
 
+/// What the tests found that end a run: of the last team (`paper`) or of the best (`standard`).
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct LastTest {
+    /// Environment steps that had trained the team.
+    pub trained: u64,
+    /// One line per channel; `prior` is the link of training.
+    pub channels: Vec<ChannelSummary>,
+}
+
 /// What the tests of a run have found so far.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Tests {
@@ -146,18 +155,19 @@ impl Trainer {
         Ok(mean)
     }
 
-    /// The tests that end a run, into its directory.
+    /// The tests that end a run, into its directory; what they found, where its protocol has any.
     ///
     /// # Errors
     /// [`TrainError`].
-    pub fn test_at_end(&self) -> Result<(), TrainError> {
+    pub fn test_at_end(&self) -> Result<Option<LastTest>, TrainError> {
         let episodes = self.config.evaluation.episodes();
         match self.config.evaluation.protocol {
-            Protocol::None => Ok(()),
+            Protocol::None => Ok(None),
             Protocol::Paper => {
                 let (params, seed) = (self.learner.params.actors.read().to_vec(), evaluation_seed(&self.config));
                 let rows = self.test(&params, &suite("paper")?, episodes, seed)?;
-                write_evaluation(&self.dir, &self.config, self.learner.actors.len(), &rows)
+                write_evaluation(&self.dir, &self.config, self.learner.actors.len(), &rows)?;
+                Ok(Some(LastTest { trained: self.step, channels: summarise(&rows) }))
             }
             Protocol::Standard => {
                 let seeds = Seeds::new(evaluation_seed(&self.config));
@@ -175,7 +185,8 @@ impl Trainer {
                     seeds.child("absolute").seed(),
                 )?;
                 checkpoint::save_best(self, &tests.best)?;
-                self.write_standard(&tests, &last)
+                self.write_standard(&tests, &last)?;
+                Ok(Some(LastTest { trained: tests.best.step, channels: summarise(&last) }))
             }
         }
     }

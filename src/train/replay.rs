@@ -20,6 +20,9 @@ pub struct Replay {
     pub capacity: usize,
     /// Episodes pushed so far.
     pub pushed: u64,
+    /// Whether messages are made by encoders: updates compute them anew from the observations, and what an episode says
+    /// was sent is not looked at. Otherwise a message must be the sender's observation.
+    pub encoded: bool,
     learners: Vec<usize>,
     names: Vec<String>,
     /// Widths of a row: observations, actions, links.
@@ -39,8 +42,7 @@ pub struct Replay {
 }
 
 impl Replay {
-    /// An empty memory for episodes of this layout; learners must be the communicators, and a message the sender's
-    /// observation.
+    /// An empty memory for episodes of this layout; learners must be the communicators.
     ///
     /// # Errors
     /// [`TrainError::Store`] when learners and communicators differ, or `capacity` is less than an episode.
@@ -59,6 +61,7 @@ impl Replay {
             steps,
             capacity: capacity / steps,
             pushed: 0,
+            encoded: false,
             names: learners.iter().map(|&a| layout.agents[a].name.clone()).collect(),
             widths: [own[0].iter().sum(), own[1].iter().sum(), learners.len() * learners.len()],
             own,
@@ -151,7 +154,7 @@ impl Replay {
         Ok(())
     }
 
-    /// Every episode has T steps, and sends what it observes.
+    /// Every episode has T steps, and sends what it observes, unless an encoder sends.
     fn check_rows(&self, rows: &Rows<'_>) -> Result<(), TrainError> {
         let period = self.steps + 1;
         let ends = rows.ends.iter().enumerate();
@@ -162,6 +165,9 @@ impl Replay {
         let whole = rows.ends.len();
         if rows.step + rows.count - whole * period > self.steps {
             return Err(self.length(rows.episode + whole as u64, &format!("more than {}", self.steps)));
+        }
+        if self.encoded {
+            return Ok(());
         }
         for ((name, observation), message) in self.names.iter().zip(&rows.observations).zip(&rows.messages) {
             if !std::ptr::eq(*observation, *message) && observation != message {
@@ -186,7 +192,7 @@ impl Replay {
         if episode.steps != self.steps {
             return Err(self.length(episode.index, &episode.steps.to_string()));
         }
-        for (name, &a) in self.names.iter().zip(&self.learners) {
+        for (name, &a) in self.names.iter().zip(&self.learners).filter(|_| !self.encoded) {
             if episode.messages[a].data != episode.observations[a].data {
                 return Err(not_observed(episode.index, name));
             }
@@ -239,6 +245,12 @@ impl Replay {
         [row * o, transition * a, row * l]
     }
 
+    /// A transition's observations, of all learners.
+    pub(super) fn observed(&self, transition: usize) -> &[f32] {
+        let [at, ..] = self.places(transition);
+        &self.observations[at..at + self.widths[0]]
+    }
+
     /// Gives each row of `batch` the link bits of another transition, for o and o' alike ([`Masks::Redrawn`]).
     ///
     /// [`Masks::Redrawn`]: crate::algo::Masks::Redrawn
@@ -261,6 +273,7 @@ impl Replay {
             &mut batch.actions,
             &mut batch.reward,
             &mut batch.bonus,
+            &mut batch.messages,
         ] {
             buffer.clear();
         }

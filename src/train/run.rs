@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::config::TrainConfig;
 use super::trainer::Trainer;
-use super::{TrainError, directory};
+use super::{LastTest, TrainError, directory};
 
 /// How a run is started.
 #[derive(Debug, Default)]
@@ -44,9 +44,14 @@ pub struct Report {
     pub next_critic_loss: Option<f64>,
     /// Whether it was stopped before its last step.
     pub interrupted: bool,
+    /// Whether it had taken its last step before: nothing was left to do.
+    pub was_finished: bool,
     /// Files of earlier tests that were removed when the run went on, and that it did not write anew.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub removed: Vec<&'static str>,
+    /// What the tests found that belong to the end of the run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub test: Option<LastTest>,
 }
 
 /// Trains as `config` says into the run directory `dir`, which gets `config.toml`, `metrics.parquet`, `timings.parquet`,
@@ -78,6 +83,7 @@ pub fn train(
         Some(path) => Some(crate::storage::create(path, &trainer.manifest(), false)?), // data outlives a run
         None => None,
     };
+    let was_finished = options.resume && trainer.step >= trainer.config.steps;
     // nothing that was there is touched before everything that can be refused has been
     let mut removed = Vec::new();
     let _new = if options.resume {
@@ -107,9 +113,7 @@ pub fn train(
         sink.finish()?;
     }
     let interrupted = trainer.step < trainer.config.steps;
-    if !interrupted {
-        trainer.test_at_end()?;
-    }
+    let test = if interrupted { None } else { trainer.test_at_end()? };
     removed.retain(|name| !dir.join(name).exists());
     Ok(Report {
         steps: trainer.step,
@@ -118,6 +122,8 @@ pub fn train(
         return_mean: trainer.return_mean(),
         next_critic_loss: trainer.next_critic_loss(),
         interrupted,
+        was_finished,
         removed,
+        test,
     })
 }

@@ -80,13 +80,18 @@ impl Trainer {
         let prior = build_link(prior, scenario.as_ref())?;
         let episodes = config.steps.div_ceil(scenario.steps() as u64);
         check_link(prior.as_ref(), episodes.max(config.evaluation.over_prior()))?;
-        let layout = scenario.layout();
+        let mut layout = scenario.layout();
         let seeds = Seeds::new(config.seed).child("train");
-        let learners: Vec<_> = layout.agents.iter().filter(|a| a.learner).collect();
+        let learners: Vec<_> = scenario.agents().iter().filter(|a| a.learner).collect();
         let output = if scenario.space().decoder.low() < 0.0 { Activation::Tanh } else { Activation::Sigmoid };
         let mut learner = Maddpg::new(&learners, output, config.maddpg.clone(), &seeds)?;
         learner.actors.scenario = scenario.parameters();
-        let replay = Replay::new(&layout, scenario.steps(), config.replay)?;
+        let mut replay = Replay::new(&layout, scenario.steps(), config.replay)?;
+        if learner.actors.encodes() {
+            replay.encoded = true;
+            let sent = layout.agents.iter_mut().filter(|a| a.learner).zip(&learner.actors.message);
+            sent.for_each(|(agent, width)| agent.message = *width);
+        }
         let weights = config.weights();
         let shaped = weights.iter().any(|&w| w > 0.0) && learners.len() > 1;
         let dumie = if shaped { Some(Dumie::new(&layout, config.dumie.clone(), weights, &seeds)?) } else { None };
@@ -241,7 +246,8 @@ impl Trainer {
         self.bonus.clear();
         if let Some(dumie) = &mut self.dumie {
             let mut heldout = report.then(|| self.seeds.indexed_stream("heldout", self.update));
-            let found = dumie.train(&self.replay, &mut rng, heldout.as_mut())?;
+            let encoder = self.learner.actors.encodes().then_some(&mut self.learner);
+            let found = dumie.train(&self.replay, encoder, &mut rng, heldout.as_mut())?;
             for (name, value) in [
                 ("jsd", found.jsd),
                 ("jsd_heldout", found.jsd_heldout),
@@ -251,7 +257,10 @@ impl Trainer {
                 self.means.add(name, value);
             }
             match self.config.dumie.shaping {
-                Shaping::Minibatch => dumie.bonus(&self.batch, &mut rng, &mut self.bonus),
+                Shaping::Minibatch => {
+                    self.learner.encode_batch(&mut self.batch);
+                    dumie.bonus(&self.batch, &mut rng, &mut self.bonus);
+                }
                 Shaping::AtRollout => self.bonus.clone_from(&self.batch.bonus),
             }
             let rows = self.bonus.len() as f64;
@@ -271,6 +280,7 @@ impl Trainer {
         self.means.add("q_mean", found.q_mean);
         self.means.add("critic_grad_norm", found.critic_grad_norm);
         self.means.add("actor_grad_norm", found.actor_grad_norm);
+        self.means.add("encoder_grad_norm", found.encoder_grad_norm);
         self.update += 1;
         if report {
             let noise = self.team.noise.scale(self.episode);

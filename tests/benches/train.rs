@@ -13,7 +13,7 @@ use std::time::Instant;
 use ccmarl::algo::{ActorStep, Batch, Maddpg, MaddpgConfig, Messages};
 use ccmarl::io::write_atomic;
 use ccmarl::nn::{Activation, Level, Mlp, Tape};
-use ccmarl::record::{self, Recording};
+use ccmarl::record::{self, ActionNoise, Recording, Trained};
 use ccmarl::registry::Spec;
 use ccmarl::rng::Seeds;
 use ccmarl::schema::{AgentSpec, Episode};
@@ -51,13 +51,20 @@ impl Bench {
         let spec = Spec::new("simple_spread").with("decoder", "mpe5");
         let scenario = ccmarl::scenario::build(&spec).unwrap();
         let link = record::build_link(&Spec::new("dropout").with("p", 0.2), &*scenario).unwrap();
-        let policy = record::build_policy(&Spec::new("random"), &*scenario).unwrap();
+        let learners: Vec<&AgentSpec> = scenario.agents().iter().filter(|a| a.learner).collect();
+        let seeds = Seeds::new(1);
+        let learner = Maddpg::new(&learners, Activation::Tanh, config, &seeds).unwrap();
+        let mut policy = record::build_policy(&Spec::new("random"), &*scenario).unwrap();
+        if learner.actors.encodes() {
+            let params = learner.params.actors.read();
+            let noise = ActionNoise::Gaussian(1.0);
+            policy = Box::new(Trained::new(learner.actors.clone(), &params, noise, serde_json::Map::new()));
+        }
         let recording = Recording { scenario: &*scenario, link: &*link, policy: &*policy, seed: 1, episodes: 400 };
         let episodes: Vec<Episode> = (0..400).map(|index| recording.episode(index)).collect();
-        let layout = scenario.layout();
-        let learners: Vec<&AgentSpec> = layout.agents.iter().filter(|a| a.learner).collect();
-        let seeds = Seeds::new(1);
+        let layout = recording.layout();
         let mut replay = Replay::new(&layout, scenario.steps(), 100_000).unwrap();
+        replay.encoded = learner.actors.encodes();
         let mut dumie = dumie.map(|config| Dumie::new(&layout, config, [0.01, 0.01], &seeds).unwrap());
         for episode in &episodes {
             replay.push(episode, &[]).unwrap();
@@ -65,7 +72,6 @@ impl Bench {
                 dumie.observe(episode);
             }
         }
-        let learner = Maddpg::new(&learners, Activation::Tanh, config, &seeds).unwrap();
         Self { learner, dumie, replay, batch: Batch::default(), bonus: Vec::new(), update: 0 }
     }
 
@@ -81,8 +87,10 @@ impl Bench {
         lap(&mut parts[0]);
         self.bonus.clear();
         if let Some(dumie) = &mut self.dumie {
-            dumie.train(&self.replay, &mut rng, None).unwrap();
+            let encoder = self.learner.actors.encodes().then_some(&mut self.learner);
+            dumie.train(&self.replay, encoder, &mut rng, None).unwrap();
             lap(&mut parts[1]);
+            self.learner.encode_batch(&mut self.batch);
             dumie.bonus(&self.batch, &mut rng, &mut self.bonus);
             lap(&mut parts[2]);
         }
@@ -116,8 +124,14 @@ impl Bench {
         let first = critic.weight(0).0[0];
         // target, value, gradient of the weights, of the hidden layers; value again, gradient of the actions
         let mut mac = 4 * products(critic, 0) + 2 * products(critic, 1) + first * actions;
-        for actor in &self.learner.actors.networks {
-            mac += 3 * products(actor, 0) + products(actor, 1);
+        let actors = &self.learner.actors;
+        for network in actors.networks.iter().chain(&actors.encoders) {
+            mac += 3 * products(network, 0) + products(network, 1);
+        }
+        if actors.encodes() {
+            // gradients of the messages, through the first layer of each receiver
+            let heard = |i: usize| actors.networks[i].inputs() - actors.observation[i];
+            mac += (0..actors.len()).map(|i| heard(i) * actors.networks[i].weight(0).0[0]).sum::<usize>();
         }
         2.0 * (mac * BATCH) as f64
     }
@@ -135,15 +149,19 @@ fn main() {
     let parts = "ms_minibatch,ms_dumie_train,ms_dumie_evaluate,ms_networks";
     line(format!("case,ms_per_update,{parts},mflop_networks,gflop_per_s,of_kernel"));
     let off = MaddpgConfig { messages: Messages::Off, ..MaddpgConfig::default() };
+    let encoder = MaddpgConfig { messages: Messages::Encoder, ..MaddpgConfig::default() };
     let per_agent = |config: MaddpgConfig| MaddpgConfig { actor_step: ActorStep::PerAgent, ..config };
     let with = |negatives| Some(DumieConfig { negatives, ..DumieConfig::default() });
     for (name, config, dumie) in [
         ("no messages", off.clone(), None),
         ("messages", MaddpgConfig::default(), None),
+        ("encoded messages", encoder.clone(), None),
         ("cc-maddpg 16 negatives", MaddpgConfig::default(), with(Negatives::Count(16))),
+        ("cc-maddpg encoded messages", encoder.clone(), with(Negatives::Count(16))),
         ("cc-maddpg all negatives", MaddpgConfig::default(), with(Negatives::All)),
         ("no messages per-agent", per_agent(off), None),
         ("messages per-agent", per_agent(MaddpgConfig::default()), None),
+        ("encoded messages per-agent", per_agent(encoder), None),
     ] {
         let joint = config.actor_step == ActorStep::Joint;
         let mut bench = Bench::new(config, dumie);

@@ -1,4 +1,4 @@
-"""Runs README's snippet that loads a trained team in PyTorch, and compares its actions with recorded ones.
+"""Runs README's snippet that loads a trained team in PyTorch, and compares its messages and actions with recorded ones.
 
 usage: act_in_pytorch.py ACTORS.safetensors STORE    (a directory that `ccmarl record --policy run:…` wrote)
 """
@@ -25,9 +25,12 @@ for t in range(len(rows["step"])):
     observations = [rows[f"observation.{name}"][t] for name in learners]
     link = torch.tensor(rows["link"][t]).reshape(len(learners), len(learners))
     lost += int((~link).sum())
-    for name, action in zip(learners, act(observations, link)):
+    for name, action, message in zip(learners, act(observations, link), act.send(observations)):
+        recorded = torch.tensor(rows[f"message.{name}"][t])
+        assert message.shape == recorded.shape, f"message.{name} has {len(recorded)} numbers, the team sends {len(message)}"
+        worst = max(worst, (message - recorded).abs().max().item())
         worst = max(worst, (action - torch.tensor(rows[f"action.{name}"][t])).abs().max().item())
         compared += 1
 assert compared > 1000 and lost > 100, "the store is too small to say anything"
-assert worst < 1e-6, f"an action differs by {worst}"
-print(f"ok torch {torch.__version__}: {compared} actions within {worst:.1e} of the recorded ones, {lost} messages lost")
+assert worst < 1e-6, f"an action or a message differs by {worst}"
+print(f"ok torch {torch.__version__}: {compared} messages of {len(recorded)} and actions within {worst:.1e} of the recorded ones, {lost} messages lost")

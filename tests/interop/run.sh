@@ -58,10 +58,15 @@ ccmarl list metric --format json > "$work/metrics.json"
 "$bin/python" tests/interop/read_run.py "$work/run" "$work/metrics.json"
 ccmarl record --scenario simple_spread --policy "run:$work/run" --link dropout:0.3 --episodes 60 --force --out "$work/acted" >/dev/null 2>&1
 torch=${CCMARL_TORCH_PYTHON:-$bin/python}
-if "$torch" -c "import torch, safetensors" >/dev/null 2>&1; then
+if "$torch" -c "import torch, safetensors, pyarrow" >/dev/null 2>&1; then
     "$torch" tests/interop/act_in_pytorch.py "$work/run/checkpoint/actors.safetensors" "$work/acted"
+    # and a team whose messages are an encoder's
+    printf 'algorithm = "cc-maddpg"\nsteps = 30000\nscenario = { name = "simple_spread" }\n[maddpg]\nmessages = "encoder"\n' > "$work/encoder.toml"
+    ccmarl train --config "$work/encoder.toml" --force --out "$work/encoded" >/dev/null 2>&1
+    ccmarl record --scenario simple_spread --policy "run:$work/encoded" --link dropout:0.3 --episodes 60 --force --out "$work/sent" >/dev/null 2>&1
+    "$torch" tests/interop/act_in_pytorch.py "$work/encoded/checkpoint/actors.safetensors" "$work/sent"
 else
-    echo "skipped: no PyTorch (CCMARL_TORCH_PYTHON names a python that has it)"
+    echo "skipped: no PyTorch with safetensors and pyarrow (CCMARL_TORCH_PYTHON names a python that has them)"
 fi
 
 # what mpe2 does with a seed that no golden store has, written by Python, played again step by step

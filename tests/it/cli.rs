@@ -262,5 +262,5 @@ fn tables_of_pairs_and_networks_have_their_bounds() {
         .and_then(|mut f| std::io::Write::write_all(&mut f, config.as_bytes()))
         .unwrap();
     let (code, _, err) = run(&["train", "--config", &path("c.toml"), "--out", &path("run")]);
-    assert!(code == 2 && err.contains("maddpg.hidden: expected at most 16 layers of at most 4096 units"), "{err}");
+    assert!(code == 2 && err.contains("maddpg.hidden: expected at most 16 layers of 1 to 4096 units"), "{err}");
 }

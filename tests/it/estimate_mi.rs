@@ -579,8 +579,37 @@ fn calibrate_prints_errors_and_refuses_unknown_tasks() {
     let found: Value = serde_json::from_str(&json).unwrap();
     // 1v1-normal and its CDF twin, its wiggly and half-cube ones, and the dense one
     assert_eq!((found["tasks"].as_array().unwrap().len(), found["total"][0]["tasks"].as_u64()), (12, Some(6)));
+    assert_eq!(found["checks"].as_array().unwrap().len(), 0);
     let (code, _, err) = calibrate(&["--task", "zzz"]);
     assert!(code == 2 && err.contains("no task contains zzz; the tasks are 1v1-normal-0.75"), "{err}");
+    let (code, _, err) = calibrate(&["--task", "none"]);
+    assert!(code == 2 && err.contains("--task none leaves only checks: give --checks a number"), "{err}");
+    let (code, _, err) = calibrate(&["--task", "none", "--checks", "1", "--plot", "x.svg"]);
+    assert!(code == 2 && err.contains("--plot draws tasks: leave out --task none"), "{err}");
+
+    // checks: intervals of six, p-values of six; a file and a picture, which only ours replace
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name).display().to_string();
+    let (table, picture) = (at("rows.csv"), at("errors.svg"));
+    let args = [&args[..], &["--checks", "3", "--out", &table, "--plot", &picture]].concat();
+    let (code, out, err) = calibrate(&args);
+    assert_eq!(code, 0, "{err}");
+    for words in ["check", "p ≤ 0.05", "normal-2-2-0.75", "series-0.98-0.3"] {
+        assert!(out.contains(words), "{words}: {out}");
+    }
+    let rows = std::fs::read_to_string(&table).unwrap();
+    assert!(rows.starts_with("task,truth,estimator,kind,seeds,mean,deviation,error,covered,rejected\n"), "{rows}");
+    // twelve of tasks and twenty-four of checks
+    assert_eq!(rows.lines().count(), 1 + 12 + 24);
+    assert!(std::fs::read_to_string(&picture).unwrap().contains("multinormal-dense-2-2-0.5"));
+    let (code, _, err) = calibrate(&args);
+    assert!(code == 2 && err.contains("output exists: give --force to replace it"), "{err}");
+    assert_eq!(calibrate(&[&args[..], &["--force"]].concat()).0, 0);
+    std::fs::write(&table, "mine\n").unwrap();
+    let (code, _, err) = calibrate(&[&args[..], &["--force"]].concat());
+    assert!(code != 0 && std::fs::read_to_string(&table).unwrap() == "mine\n", "{err}");
+    let (code, _, err) = calibrate(&["--out", "rows.txt"]);
+    assert!(code == 2 && err.contains("expected a name that ends in .json, .csv or .parquet"), "{err}");
 }
 
 fn assert_golden(case: &str, found: &Value, golden: &Value) {

@@ -2,7 +2,7 @@
 
 use ccmarl::algo::{ActorStep, Batch, Maddpg, MaddpgConfig, Messages};
 use ccmarl::nn::Activation;
-use ccmarl::record::{Recording, build_link, build_policy};
+use ccmarl::record::{ActionNoise, Recording, Trained, build_link};
 use ccmarl::registry::Spec;
 use ccmarl::rng::{self, Seeds};
 use ccmarl::schema::{AgentSpec, Controller};
@@ -12,13 +12,15 @@ use ccmarl::train::replay::Replay;
 
 use super::allocations::allocations;
 
-/// A replay of random play over lossy links, which `dumie` has observed too.
-fn replay(dumie: &mut Dumie) -> Replay {
+/// A replay of this learner's play over lossy links, which `dumie` has observed too.
+fn replay(learner: &Maddpg, dumie: &mut Dumie) -> Replay {
     let scenario = ccmarl::scenario::build(&Spec::new("simple_spread")).unwrap();
     let link = build_link(&Spec::new("dropout").with("p", 0.2), &*scenario).unwrap();
-    let policy = build_policy(&Spec::new("random"), &*scenario).unwrap();
-    let recording = Recording { scenario: &*scenario, link: &*link, policy: &*policy, seed: 1, episodes: 60 };
+    let params = learner.params.actors.read();
+    let policy = Trained::new(learner.actors.clone(), &params, ActionNoise::Gaussian(1.0), serde_json::Map::new());
+    let recording = Recording { scenario: &*scenario, link: &*link, policy: &policy, seed: 1, episodes: 60 };
     let mut replay = Replay::new(&scenario.layout(), scenario.steps(), 10_000).unwrap();
+    replay.encoded = learner.actors.encodes();
     for index in 0..60 {
         let episode = recording.episode(index);
         replay.push(&episode, &[]).unwrap();
@@ -46,20 +48,28 @@ fn an_update_allocates_nothing_of_its_own_once_it_is_warm() {
                 ..DumieConfig::default()
             },
         ),
+        (
+            MaddpgConfig { messages: Messages::Encoder, ..MaddpgConfig::default() },
+            DumieConfig { pairs: PairSource::Replay, ..DumieConfig::default() },
+        ),
         (MaddpgConfig::default(), DumieConfig { negatives: Negatives::All, batch: 100, ..DumieConfig::default() }),
     ];
     for (config, estimators) in variants {
         let rows = if estimators.negatives == Negatives::All { 100 } else { 1024 };
         let seeds = Seeds::new(1);
-        let mut dumie = Dumie::new(&layout, estimators, [0.01, 0.01], &seeds).unwrap();
-        let replay = replay(&mut dumie);
         let mut learner = Maddpg::new(&learners, Activation::Tanh, config, &seeds).unwrap();
+        let encodes = learner.actors.encodes();
+        let mut layout = layout.clone();
+        layout.agents.iter_mut().zip(&learner.actors.message).for_each(|(agent, width)| agent.message = *width);
+        let mut dumie = Dumie::new(&layout, estimators, [0.01, 0.01], &seeds).unwrap();
+        let replay = replay(&learner, &mut dumie);
         let (mut batch, mut bonus) = (Batch::default(), Vec::new());
         let mut update = |index: u64| {
             let mut rng = seeds.indexed_stream("update", index);
             replay.sample(&mut rng, rows, &mut batch);
             replay.redraw_links(&mut rng, &mut batch);
-            let metrics = dumie.train(&replay, &mut rng, None).unwrap();
+            let metrics = dumie.train(&replay, encodes.then_some(&mut learner), &mut rng, None).unwrap();
+            learner.encode_batch(&mut batch);
             dumie.bonus(&batch, &mut rng, &mut bonus);
             assert!(metrics.jsd.is_some() && metrics.club.is_some() && bonus.iter().any(|&b| b != 0.0));
             learner.update(&batch, &bonus).unwrap();

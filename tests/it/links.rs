@@ -22,7 +22,7 @@ fn setting(distance_unit: f64) -> Setting {
 }
 
 /// Files that examples name.
-fn files() -> tempfile::TempDir {
+pub(crate) fn files() -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     let mut rows = "episode,step,sender,receiver,delivered\n".to_owned();
     for (episode, step) in (0..3).flat_map(|e| (0..26).map(move |t| (e, t))) {
@@ -46,7 +46,7 @@ pub(crate) fn classifier() -> Value {
 }
 
 /// A valid use of every link: extend this when a new link needs a parameter.
-fn example(name: &str, dir: &Path) -> Spec {
+pub(crate) fn example(name: &str, dir: &Path) -> Spec {
     let path = |file: &str| dir.join(file).display().to_string();
     let text = match name {
         "dropout" => "dropout:0.3".to_owned(),

@@ -5,6 +5,7 @@
 //! its action. Each step earns −(x − ¾ b)². Knowing b, the best is x = ½ b, then ¾ b: −1/16 in all. A receiver that does
 //! not know b stands at places x₁, x₂ that do not depend on it: E −(x − ¾ b)² = −(x² + 9/16) each, −9/8 in all at best.
 
+use ccmarl::algo::Messages;
 use ccmarl::link::channel;
 use ccmarl::record::{ActionNoise, Trained};
 use ccmarl::registry::Spec;
@@ -92,12 +93,16 @@ impl Scenario for Probe {
 }
 
 /// Trains and tests on 400 episodes over the training link: the mean return.
-fn trained(algorithm: &str) -> f64 {
+fn trained(algorithm: &str, messages: Messages) -> f64 {
     let mut config = TrainConfig::new(Spec::new("probe"), algorithm);
     (config.steps, config.replay, config.update_every) = (24_000, 5000, 10);
     (config.maddpg.hidden, config.maddpg.batch) = (vec![32], Some(128));
     (config.maddpg.actor_learning_rate, config.maddpg.critic_learning_rate) = (2e-3, 4e-3);
     config.noise.episodes = 6000;
+    config.maddpg.messages = messages;
+    if messages == Messages::Encoder {
+        (config.maddpg.message_width, config.maddpg.encoder_hidden) = (Some(2), Some(vec![16]));
+    }
     let config = config.resolve_for(&Probe::new()).unwrap();
     let mut trainer = Trainer::in_scenario(config, Box::new(Probe::new()), std::path::Path::new("unused")).unwrap();
     while trainer.step() < trainer.config.steps {
@@ -125,10 +130,12 @@ fn share() -> f64 {
 
 #[test]
 fn full_communication_solves_what_nobody_can_without_messages() {
-    let (with, without, share) = (trained("fc-maddpg"), trained("maddpg"), share());
     // places that do not depend on b: −Σ (x² + 9/16 − 3/2 x (2 share − 1)) is at most this, for any x
-    let bound = SILENT * (1.0 - (2.0 * share - 1.0).powi(2));
-    assert!(without <= bound + 1e-6, "{without} is above what any silent team can earn, {bound}");
-    assert!(without > bound - 0.3, "even the silent optimum was missed: {without}");
-    assert!(with > OPTIMUM - 0.1, "{with} is far from the optimum {OPTIMUM}");
+    let bound = SILENT * (1.0 - (2.0 * share() - 1.0).powi(2));
+    for messages in [Messages::Observation, Messages::Encoder] {
+        let (with, without) = (trained("fc-maddpg", messages), trained("maddpg", messages));
+        assert!(without <= bound + 1e-6, "{without} is above what any silent team can earn, {bound}, {messages:?}");
+        assert!(without > bound - 0.3, "even the silent optimum was missed: {without}, {messages:?}");
+        assert!(with > OPTIMUM - 0.1, "{with} is far from the optimum {OPTIMUM}, {messages:?}");
+    }
 }

@@ -4,7 +4,7 @@ use std::io::{BufRead as _, BufReader};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use assert_cmd::Command;
-use ccmarl::algo::{Actors, Team, TeamScratch};
+use ccmarl::algo::{Actors, EncoderScratch, MaddpgConfig, Messages, Sight, Team, TeamScratch};
 use ccmarl::link::{LINKS, Link};
 use ccmarl::nn::{Activation, Tape};
 use ccmarl::record::{
@@ -101,9 +101,10 @@ fn every_policy_fills_every_scenario_and_its_parameters_build_it_again() {
 }
 
 /// A team with fresh networks for a scenario.
-fn team(scenario: &dyn Scenario, noise: ActionNoise) -> (Trained, Vec<f32>) {
+fn team(scenario: &dyn Scenario, messages: Messages, noise: ActionNoise) -> (Trained, Vec<f32>) {
+    let config = MaddpgConfig { hidden: vec![32, 32], messages, message_width: Some(5), ..MaddpgConfig::default() };
     let learners: Vec<_> = scenario.agents().iter().filter(|a| a.learner).collect();
-    let actors = Actors::new(&learners, &[32, 32], Activation::Tanh, true);
+    let actors = Actors::new(&learners, Activation::Tanh, &config);
     let params = actors.init(&mut Seeds::new(5).stream("team"));
     (Trained::new(actors, &params, noise, serde_json::Map::new()), params)
 }
@@ -113,10 +114,10 @@ fn worlds_that_move_together_play_the_episodes_that_they_play_alone() {
     let noise = ActionNoise::OrnsteinUhlenbeck { theta: 0.15, sigma: 0.2, scale: 0.3, episodes: 20 };
     for scenario in SCENARIOS {
         let mut parts = Parts::new(scenario.name, 2, "markov:heavy", "random");
-        let (trained, _) = team(&*parts.0, noise);
+        let trained = [Messages::Observation, Messages::Encoder].map(|messages| team(&*parts.0, messages, noise).0);
         let policies: Vec<Box<dyn Policy>> = examples()
             .map(|p| build_policy(&Spec::parse("policy", POLICIES, p).unwrap(), &*parts.0).unwrap())
-            .chain([Box::new(trained) as Box<dyn Policy>])
+            .chain(trained.map(|trained| Box::new(trained) as Box<dyn Policy>))
             .collect();
         for policy in policies {
             parts.2 = policy;
@@ -132,24 +133,44 @@ fn worlds_that_move_together_play_the_episodes_that_they_play_alone() {
 #[test]
 fn a_team_acts_on_its_observation_and_the_messages_that_arrived_and_its_noise_falls_to_zero() {
     let mut parts = Parts::new("simple_adversary", 3, "dropout:0.5", "random");
-    let (trained, params) = team(&*parts.0, ActionNoise::None);
-    let actors = trained.actors.clone();
-    parts.2 = Box::new(trained);
-    let calm = parts.recording(1, 0).together(&parts.recording(1, 0).layout(), 4, 1).remove(0);
     let mut tape = Tape::default();
-    for row in 0..calm.steps {
-        let observations: Vec<f32> = calm.observations.iter().flat_map(|o| o.row(row).to_vec()).collect();
-        for i in 0..3 {
-            let mut input = Vec::new();
-            actors.push_input(i, &observations, &calm.link[row * 9..row * 9 + 9], &mut input);
-            let expected = actors.act(&params, i, &input, 1, &mut tape);
-            let error = expected.iter().zip(calm.actions[i].row(row)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-            assert!(error < 1e-6, "{error}");
+    let mut play = |messages: Messages| {
+        let (trained, params) = team(&*parts.0, messages, ActionNoise::None);
+        let actors = trained.actors.clone();
+        parts.2 = Box::new(trained);
+        let layout = parts.recording(1, 0).layout();
+        let calm = parts.recording(1, 0).together(&layout, 4, 1).remove(0);
+        calm.check(&layout).unwrap();
+        for row in 0..calm.steps {
+            let observations: Vec<f32> = calm.observations.iter().flat_map(|o| o.row(row).to_vec()).collect();
+            let messages: Vec<f32> = calm.messages.iter().flat_map(|m| m.row(row).to_vec()).collect();
+            // what is recorded is what was sent, before the channel
+            for j in 0..3 {
+                let seen = calm.observations[j].row(row);
+                let sent = match actors.encoders.get(j) {
+                    Some(encoder) => encoder.forward(&params[actors.encoder_range(j)], seen, 1, &mut tape),
+                    None => seen,
+                };
+                let pairs = sent.iter().zip(calm.messages[j].row(row));
+                assert!(sent.len() == calm.messages[j].width && pairs.into_iter().all(|(a, b)| (a - b).abs() < 1e-6));
+            }
+            for i in 0..3 {
+                let mut input = Vec::new();
+                actors.push_input(i, &observations, &messages, &calm.link[row * 9..row * 9 + 9], &mut input);
+                let expected = actors.act(&params, i, &input, 1, &mut tape);
+                let pairs = expected.iter().zip(calm.actions[i].row(row));
+                let error = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+                assert!(error < 1e-6, "{error}");
+            }
         }
-    }
+        calm
+    };
+    let encoded = play(Messages::Encoder);
+    assert!(encoded.messages.iter().all(|m| m.width == 5 && m.data.iter().all(|v| v.abs() < 1.0)));
+    let calm = play(Messages::Observation);
     let noise = ActionNoise::OrnsteinUhlenbeck { theta: 0.15, sigma: 0.2, scale: 0.3, episodes: 4 };
     assert_eq!([0, 1, 2, 4, 9].map(|episode| noise.scale(episode)), [0.3, 0.3 * 3.0 / 4.0, 0.15, 0.0, 0.0]);
-    parts.2 = Box::new(team(&*parts.0, noise).0);
+    parts.2 = Box::new(team(&*parts.0, Messages::Observation, noise).0);
     let layout = parts.recording(1, 0).layout();
     let noisy = parts.recording(1, 0).together(&layout, 3, 2);
     assert_ne!(noisy[0].actions, parts.recording(1, 0).episode(4).actions);
@@ -159,14 +180,20 @@ fn a_team_acts_on_its_observation_and_the_messages_that_arrived_and_its_noise_fa
 #[test]
 fn acting_allocates_nothing_once_it_is_warm() {
     let parts = Parts::new("simple_spread", 3, "dropout:0.5", "random");
-    let (trained, params) = team(&*parts.0, ActionNoise::None);
-    let (mut acting, mut scratch) = (Team::default(), TeamScratch::default());
-    acting.load_forward(&trained.actors, &params);
-    let (observations, link) = (vec![0.5; 5 * 54], [false; 45]);
-    acting.act(&trained.actors, &observations, &link, 5, &mut scratch);
-    let counted =
-        crate::allocations::allocations(|| acting.act(&trained.actors, &observations, &link, 5, &mut scratch));
-    assert_eq!(counted, 0);
+    for messages in [Messages::Observation, Messages::Encoder] {
+        let (trained, params) = team(&*parts.0, messages, ActionNoise::None);
+        let (mut acting, mut scratch) = (Team::default(), TeamScratch::default());
+        let (mut sending, mut sent) = (EncoderScratch::default(), Vec::new());
+        acting.load_forward(&trained.actors, &params);
+        let (observations, link) = (vec![0.5; 5 * 54], [false; 45]);
+        let mut act = || {
+            acting.encode(&trained.actors, (&observations, 5), &mut sending, &mut sent);
+            let sight = Sight { observations: &observations, messages: &sent, link: &link };
+            acting.act(&trained.actors, sight, 5, &mut scratch);
+        };
+        act();
+        assert_eq!(crate::allocations::allocations(act), 0, "{messages:?}");
+    }
 }
 
 #[test]

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use ccmarl::registry::Spec;
-use ccmarl::train::{EvaluationConfig, Options, Protocol, Report, TrainConfig, Trainer, train};
+use ccmarl::train::{EvaluationConfig, Given, Options, Protocol, Report, TrainConfig, Trainer, train};
 use polars::prelude::{DataFrame, ParquetReader, SerReader as _};
 
 pub(crate) fn config(algorithm: &str, steps: u64) -> TrainConfig {
@@ -509,7 +509,7 @@ fn configurations_are_refused_with_their_line_or_their_name() {
     let file = dir.path().join("run.toml");
     let read = |text: &str| {
         ccmarl::io::write_atomic(&file, text.as_bytes()).unwrap();
-        TrainConfig::read(&file).and_then(TrainConfig::resolve).map(|_| ()).map_err(|e| e.to_string())
+        TrainConfig::read(&file, Given::default()).and_then(TrainConfig::resolve).map(|_| ()).map_err(|e| e.to_string())
     };
     let start = "algorithm = \"maddpg\"\nscenario = { name = \"simple_spread\" }\n";
     assert_eq!(read(start), Ok(()));

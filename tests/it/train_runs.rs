@@ -186,3 +186,110 @@ fn an_interval_without_tests_at_intervals_is_a_usage_fault() {
     }
     assert!(!out.exists());
 }
+
+#[test]
+fn a_negative_weight_is_a_number_out_of_range_and_no_flag() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("run");
+    for (flag, value) in [("--alpha", "-1"), ("--beta", "-0.5")] {
+        let (code, err) = ccmarl(&["train", "--steps", "100", flag, value, "--out", out.to_str().unwrap()]);
+        let expected = format!("dumie.{}: expected a number ≥ 0, found {value}", flag.trim_start_matches('-'));
+        assert!(code == Some(2) && err.contains(&expected), "{code:?} {err}");
+    }
+}
+
+#[test]
+fn a_file_may_leave_out_what_a_flag_says_and_a_typo_in_it_is_shown_below_the_message() {
+    let dir = tempfile::tempdir().unwrap();
+    let [file, out] = ["part.toml", "run"].map(|name| dir.path().join(name).to_str().unwrap().to_owned());
+    let train = |text: &str, flags: &[&str]| {
+        write_atomic(Path::new(&file), text.as_bytes()).unwrap();
+        ccmarl(&[&["train", "--config", &file, "--steps", "100", "--out", &out, "--force"], flags].concat())
+    };
+    let part = "# of any algorithm\nseed = 4\n[maddpg]\ngamma = 0.9\n";
+    let (code, err) = train(part, &[]);
+    assert!(code == Some(2) && err.contains("missing field `algorithm`"), "{err}");
+    let (code, err) = train(part, &["--algorithm", "maddpg"]);
+    assert!(code == Some(2) && err.contains("missing field `scenario`"), "{err}");
+    let (code, err) = train(part, &["--algorithm", "maddpg", "--scenario", "simple_spread:2"]);
+    assert_eq!(code, Some(0), "{err}");
+    let config = std::fs::read_to_string(Path::new(&out).join("config.toml")).unwrap();
+    for line in ["algorithm = \"maddpg\"", "name = \"simple_spread\"", "agents = 2", "seed = 4", "gamma = 0.9"] {
+        assert!(config.lines().any(|l| l.starts_with(line)), "{line}: {config}");
+    }
+    // what the file says stands where no flag says otherwise, and its lines are counted without what flags add
+    let whole = "algorithm = \"fc-maddpg\"\nscenario = { name = \"simple_spread\", agents = 2 }\n";
+    let (code, err) = train(whole, &["--algorithm", "maddpg"]);
+    assert_eq!(code, Some(0), "{err}");
+    let config = std::fs::read_to_string(Path::new(&out).join("config.toml")).unwrap();
+    assert!(config.contains("algorithm = \"maddpg\"") && config.contains("agents = 2"), "{config}");
+    let typo = part.replace("gamma", "gama");
+    for (text, flags, line) in [
+        (format!("{whole}[maddpg]\ngama = 0.9\n"), &[][..], 4),
+        (typo, &["--algorithm", "maddpg", "--scenario", "simple_spread"][..], 4),
+    ] {
+        let (code, err) = train(&text, flags);
+        let lines: Vec<&str> = err.lines().collect();
+        assert_eq!(code, Some(2), "{err}");
+        let start =
+            format!("error: configuration: line {line}, column 1: unknown field `gama`, expected one of `hidden`");
+        assert!(lines[0].starts_with(&start) && lines[0].ends_with(&format!(": {file}")), "{err}");
+        assert_eq!(lines[1..], [format!("  {line} | gama = 0.9").as_str(), "    | ^"], "{err}");
+    }
+    let (_, err) = train("algorithm = \"maddpg\"\nscenario = \"\u{1b}[2J\nseed = 1\n", &[]);
+    assert!(err.contains("line 2, column") && !err.contains('\u{1b}') && err.contains("\\u{1b}[2J"), "{err:?}");
+}
+
+#[test]
+fn a_finished_run_says_so_and_how_to_go_on_and_one_that_goes_on_keeps_no_estimates_of_the_team_before() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("run");
+    let out = path.to_str().unwrap();
+    run(config("maddpg", 500), &path, &Options::default());
+    write_atomic(&path.join("mi.parquet"), b"of the team before").unwrap();
+    let before = bytes(&path, "checkpoint/state.safetensors");
+    let (code, err) = ccmarl(&["train", "--out", out, "--resume"]);
+    let expected = format!(
+        "the run was finished, at 500 steps; to go on for longer: ccmarl train --out {out} --resume --steps 1000"
+    );
+    assert!(code == Some(0) && err.contains(&expected), "{code:?} {err}");
+    assert!(before == bytes(&path, "checkpoint/state.safetensors") && path.join("mi.parquet").exists());
+    let (code, err) = ccmarl(&["train", "--out", out, "--resume", "--steps", "600"]);
+    assert!(code == Some(0) && !err.contains("was finished"), "{code:?} {err}");
+    assert!(err.contains("removed mi.parquet: it was of the team before this run went on"), "{err}");
+    assert!(!path.join("mi.parquet").exists());
+}
+
+#[test]
+fn tests_that_end_a_run_are_printed_and_the_best_team_stands_in_a_table_of_its_own() {
+    let dir = tempfile::tempdir().unwrap();
+    let [path, page] = ["run", "page"].map(|name| dir.path().join(name));
+    let words = |protocol: &'static str| {
+        let out = path.to_str().unwrap();
+        ["train", "--scenario", "simple_spread:2", "--steps", "50", "--evaluate", protocol, "--force", "--out", out]
+    };
+    let train = |words: &[&str]| {
+        let output = assert_cmd::Command::new(env!("CARGO_BIN_EXE_ccmarl")).args(words).output().unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8(output.stdout).unwrap()
+    };
+    let out = train(&words("none"));
+    assert!(out.contains("training return, last logged 100 updates") && !out.contains("mbc-light"), "{out}");
+    let out = train(&words("paper"));
+    assert!(out.contains("test of the last team, that of step 50\n") && out.contains("dbc-heavy"), "{out}");
+    let out = train(&words("standard"));
+    assert!(out.contains("test of the best team, that of step 50\n") && out.contains("prior "), "{out}");
+    let out = train(&[&words("standard")[..], &["--format", "json"]].concat());
+    let json: serde_json::Value = serde_json::from_str(&out).unwrap();
+    let channels = json["report"]["test"]["channels"].as_array().unwrap();
+    assert_eq!(channels.len(), 9);
+    assert_eq!((&channels[0]["channel"], &channels[0]["episodes"]), (&"prior".into(), &320.into()));
+    let (code, err) = ccmarl(&["report", path.to_str().unwrap(), "--out", page.to_str().unwrap()]);
+    assert_eq!(code, Some(0), "{err}");
+    let table = std::fs::read_to_string(page.join("tables/simple_spread-2-paper-best-returns.csv")).unwrap();
+    let mean = channels[0]["return_mean"].as_f64().unwrap();
+    let line = table.lines().find(|line| line.contains(",prior,")).unwrap();
+    assert!(line.contains(&format!(",1,320,{mean:.6},")), "{line} and {mean}");
+    let html = std::fs::read_to_string(page.join("index.html")).unwrap();
+    assert!(html.contains("simple_spread, 2 agents, profile paper: best teams"), "no table of best teams");
+}

@@ -4,33 +4,12 @@ mod heatmap;
 mod lags;
 mod pair;
 
-use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::{outputs, ui};
-use crate::Error;
-use crate::figure::{self, Data, FIGURES};
-use crate::io::read_bytes;
+use super::outputs::Picture;
+use super::ui;
 use crate::mi::{Estimate, Plan};
-use crate::registry::find;
 use crate::schema::Samples;
-
-/// Where a picture goes.
-pub(super) struct Target {
-    path: PathBuf,
-    is_png: bool,
-}
-
-/// Checks the name before anything is computed.
-pub(super) fn target(path: &Path, force: bool) -> Result<Target, Error> {
-    let ends = |with: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(with));
-    if !ends("svg") && !ends("png") {
-        let message = format!("--plot: expected a name that ends in .svg or .png, found {}", path.display());
-        return Err(Error::Usage(message));
-    }
-    outputs::check(path, force, outputs::is_picture)?;
-    Ok(Target { path: path.to_owned(), is_png: ends("png") })
-}
 
 /// What a picture shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -51,7 +30,7 @@ pub(super) fn draw(
     failed: &[&str],
     (samples, plan): (&Arc<Vec<Samples>>, &Arc<Plan>),
     threads: u16,
-    target: &Target,
+    target: &Picture,
 ) -> anyhow::Result<bool> {
     let (figure, drawn) = match (view, samples.first()) {
         (View::Matrix, _) | (_, None) => ("mi-heatmap", heatmap::data(rows)),
@@ -61,25 +40,12 @@ pub(super) fn draw(
             None => return Ok(false),
         },
     };
-    let place = target.path.display();
+    let place = target.path().display();
     let Some((data, what)) = drawn else {
         ui::say(&format!("note: no finite value to draw: {place}"));
         return Ok(true);
     };
-    save(figure, &data, target)?;
+    target.draw(figure, &data)?;
     ui::say(&format!("drew {what}: {place}"));
     Ok(true)
-}
-
-fn save(figure: &str, data: &Data, target: &Target) -> anyhow::Result<()> {
-    let entry = find("figure", FIGURES, figure)?;
-    if target.is_png {
-        let folder = tempfile::tempdir()?;
-        let whole = folder.path().join("figure.png");
-        figure::png(entry, data, &whole)?;
-        outputs::write_png(&target.path, &read_bytes(&whole, u64::MAX - 1).map_err(Error::from)?)?;
-    } else {
-        outputs::write_svg(&target.path, figure::svg(entry, data)?)?;
-    }
-    Ok(())
 }

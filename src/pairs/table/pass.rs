@@ -161,7 +161,8 @@ impl Read {
             notes.push(format!("estimated on {wanted} of {} rows, drawn at random", self.kept));
         }
         let path = self.files.first().map(|file| file.0.clone()).unwrap_or_default();
-        if self.rows > 0 && self.kept == 0
+        if self.rows > 0
+            && self.kept == 0
             && let Some(predicate) = &self.options.filter
         {
             let predicate = predicate.text().to_owned();
@@ -223,9 +224,8 @@ fn rows_of(paths: &[PathBuf]) -> Result<Option<u64>, PairsError> {
 
 /// The error, with its row counted from the start of the table.
 fn moved(mut error: PairsError, before: u64) -> PairsError {
-    if let PairsError::Infinite { row, .. }
-    | PairsError::Ragged { row, .. }
-    | PairsError::Stray { row, .. } = &mut error
+    if let PairsError::Infinite { row, .. } | PairsError::Ragged { row, .. } | PairsError::Stray { row, .. } =
+        &mut error
     {
         *row += before as usize;
     }
@@ -420,7 +420,8 @@ mod tests {
         let path = dir.path().join("t.csv");
         let fails = |text: &str| {
             std::fs::write(&path, text).unwrap();
-            let error = pass(&[path.clone()], &of("a", "b", &[]), PieceSize { rows: 1, bytes: 40 }, &mut |_, _| ()).unwrap_err();
+            let error = pass(&[path.clone()], &of("a", "b", &[]), PieceSize { rows: 1, bytes: 40 }, &mut |_, _| ())
+                .unwrap_err();
             error.to_string()
         };
         let lines = |n: usize, line: &str| format!("{line}\n").repeat(n);

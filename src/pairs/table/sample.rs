@@ -68,7 +68,11 @@ impl Drawn {
 
     /// The rows in the order of the table, whose files are `files`, with the row behind the last one of each; `None` when
     /// there was none to draw from.
-    pub(super) fn finish(mut self, files: Vec<(PathBuf, usize)>, notes: Vec<String>) -> Result<Option<Table>, PairsError> {
+    pub(super) fn finish(
+        mut self,
+        files: Vec<(PathBuf, usize)>,
+        notes: Vec<String>,
+    ) -> Result<Option<Table>, PairsError> {
         self.prune()?;
         let places = self.keys.into_iter().map(|key| key.1).collect();
         Ok(self.kept.map(|kept| kept.drawn(files, places, notes)))

@@ -1,0 +1,246 @@
+//! Messages that encoders make: what a run with them records, keeps, resumes, starts from, and refuses.
+
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use ccmarl::algo::{ActorStep, Actors, Masks, Messages};
+use ccmarl::nn::Tape;
+use ccmarl::registry::Spec;
+use ccmarl::schema::Episode;
+use ccmarl::train::config::{Estimators, LostMessage, PairSource, Shaping};
+use ccmarl::train::{METRIC_COLUMNS, Options, TrainConfig, Trainer, train};
+
+use super::train::{LEARNED, bytes, config, run};
+
+fn encoded(algorithm: &str, steps: u64) -> TrainConfig {
+    let mut config = config(algorithm, steps);
+    (config.maddpg.messages, config.maddpg.message_width) = (Messages::Encoder, Some(4));
+    config
+}
+
+fn episodes(store: &Path) -> Vec<Episode> {
+    let mut source = ccmarl::storage::open(store).unwrap();
+    std::iter::from_fn(|| source.next_episode().unwrap()).collect()
+}
+
+/// Exit code, stdout and stderr of the program.
+fn ccmarl(words: &[&str]) -> (Option<i32>, String, String) {
+    let output = assert_cmd::Command::new(env!("CARGO_BIN_EXE_ccmarl")).args(words).output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    (output.status.code(), text(output.stdout), text(output.stderr))
+}
+
+#[test]
+fn every_way_to_train_an_encoder_differs_and_resumes_to_the_same_bytes() {
+    type Set = fn(&mut TrainConfig);
+    let options: [(&str, Set); 10] = [
+        ("defaults", |_| ()),
+        ("other width", |c| c.maddpg.message_width = Some(2)),
+        ("linear", |c| c.maddpg.encoder_hidden = Some(vec![])),
+        ("actor step per agent", |c| c.maddpg.actor_step = ActorStep::PerAgent),
+        ("masks redrawn", |c| c.maddpg.masks = Masks::Redrawn),
+        ("an estimator per link", |c| (c.dumie.estimators, c.dumie.start) = (Estimators::PerLink, 60)),
+        ("pairs from replay", |c| c.dumie.pairs = PairSource::Replay),
+        ("lost messages as zeros", |c| c.dumie.lost_message = LostMessage::Zero),
+        ("shaping at rollout", |c| c.dumie.shaping = Shaping::AtRollout),
+        ("nothing arrives", |c| c.prior = Some(Spec::new("none"))),
+    ];
+    let dir = tempfile::tempdir().unwrap();
+    let mut seen = Vec::new();
+    for (name, set) in options {
+        let mut wanted = encoded("cc-maddpg", 3000);
+        set(&mut wanted);
+        let [whole, parts] = ["whole", "parts"].map(|part| dir.path().join(name).join(part));
+        run(wanted.clone(), &whole, &Options::default());
+        let stop = AtomicBool::new(false);
+        let mut progress = |p: ccmarl::train::Progress| stop.store(p.step >= 2000, Ordering::Relaxed);
+        train(wanted.clone(), &parts, &Options::default(), &mut progress, &stop).unwrap();
+        run(wanted, &parts, &Options { resume: true, ..Options::default() });
+        for file in LEARNED.into_iter().chain(["checkpoint/state.safetensors", "config.toml"]) {
+            assert!(bytes(&whole, file) == bytes(&parts, file), "{name}: {file} differs after a stop");
+        }
+        let actors = bytes(&whole, LEARNED[0]);
+        assert!(!seen.contains(&actors), "{name} changed nothing");
+        seen.push(actors);
+    }
+}
+
+#[test]
+fn what_is_recorded_is_what_the_encoders_sent_and_every_command_takes_such_a_run() {
+    let dir = tempfile::tempdir().unwrap();
+    let [path, store, acted, page] = ["run", "store", "acted", "page"].map(|name| dir.path().join(name));
+    let word = |path: &Path| path.to_str().unwrap().to_owned();
+    // a rate at which an untrained encoder is told from a trained one
+    let mut fast = encoded("cc-maddpg", 2000);
+    fast.maddpg.actor_learning_rate = 1e-2;
+    run(fast, &path, &Options { record: Some(&store), ..Options::default() });
+    let policy = format!("run:{}", word(&path));
+    let record = ["record", "--scenario", "simple_spread", "--policy", &policy, "--link", "dropout:0.5"];
+    let (code, _, err) = ccmarl(&[&record[..], &["--episodes", "3", "--out", &word(&acted)]].concat());
+    assert_eq!(code, Some(0), "{err}");
+    let (actors, params) = Actors::load(&path).unwrap();
+    assert_eq!((actors.message.as_slice(), actors.encoders.len()), (&[4, 4, 4][..], 3));
+    let mut tape = Tape::default();
+    let mut distance = |episode: &Episode| {
+        let mut worst = 0.0f32;
+        for (j, encoder) in actors.encoders.iter().enumerate() {
+            let (observed, sent) = (&episode.observations[j], &episode.messages[j]);
+            let again = encoder.forward(&params[actors.encoder_range(j)], &observed.data, 26, &mut tape);
+            assert_eq!((sent.width, sent.data.len()), (4, again.len()));
+            worst = again.iter().zip(&sent.data).map(|(a, b)| (a - b).abs()).fold(worst, f32::max);
+        }
+        worst
+    };
+    // the trained team sends what its encoders make of what it sees; a rollout, what they made of it at the time
+    assert!(episodes(&acted).iter().all(|e| distance(e) < 1e-6));
+    let rolled: Vec<f32> = episodes(&store).iter().map(&mut distance).collect();
+    assert!(rolled[0] > 0.01 && rolled[79] < rolled[0], "{rolled:?}");
+    for words in [
+        vec!["verify", &word(&acted), "--resimulate"],
+        vec!["estimate-mi", &word(&acted), "--estimator", "gcmi", "--format", "json"],
+        vec!["evaluate", &word(&path), "--episodes", "2"],
+        vec!["report", &word(&path), "--out", &word(&page)],
+    ] {
+        let (code, out, err) = ccmarl(&words);
+        assert_eq!(code, Some(0), "{words:?}: {out}{err}");
+    }
+    assert!(page.join("index.html").exists());
+    // another world is refused as for any team
+    let (code, _, err) =
+        ccmarl(&["record", "--scenario", "simple_tag", "--policy", &policy, "--out", &word(&dir.path().join("x"))]);
+    assert!(code == Some(1) && err.contains("name was \"simple_spread\" in training"), "{err}");
+}
+
+#[test]
+fn a_warm_start_gives_the_next_critic_loss_and_the_rings_of_the_live_run() {
+    let dir = tempfile::tempdir().unwrap();
+    for (form, algorithm, steps) in [("s", "cc-maddpg", 2000), ("s.mcap", "maddpg", 1500)] {
+        let (path, store) = (dir.path().join(format!("run-{form}")), dir.path().join(form));
+        let report = run(encoded(algorithm, steps), &path, &Options { record: Some(&store), ..Options::default() });
+        assert!(report.updates > 0);
+        let resolved = encoded(algorithm, steps).resolve().unwrap();
+        let [mut live, mut warm] = [(); 2].map(|()| Trainer::new(resolved.clone(), &path).unwrap());
+        live.resume().unwrap();
+        // the run's networks before a fresh memory: what the store says was sent is not needed for the loss
+        warm.warm_start(ccmarl::storage::open(&store).unwrap().as_mut()).unwrap();
+        assert_eq!(warm.rings(), live.rings(), "rings hold what was sent at rollout, in both");
+        assert_eq!(warm.rings().is_some(), algorithm == "cc-maddpg");
+        let (from, to) = (&live.learner.params, &warm.learner.params);
+        for (from, to) in [
+            (&from.actors, &to.actors),
+            (&from.critic, &to.critic),
+            (&from.target_actors, &to.target_actors),
+            (&from.target_critic, &to.target_critic),
+        ] {
+            to.update(|params| params.copy_from_slice(&from.read())).unwrap();
+        }
+        let mut batches = [&live, &warm].map(|trainer| {
+            let mut batch = ccmarl::algo::Batch::default();
+            trainer.replay.sample(&mut ccmarl::rng::Seeds::new(1).stream("b"), 64, &mut batch);
+            batch
+        });
+        let [a, b] = &mut batches;
+        assert_eq!((&a.observations, &a.link, &a.actions), (&b.observations, &b.link, &b.actions));
+        live.learner.encode_batch(a);
+        warm.learner.encode_batch(b);
+        assert!(a.messages.len() == 64 * 12 && a.messages == b.messages, "messages are computed anew");
+        let found = live.next_critic_loss().unwrap();
+        assert_eq!(Some(found.to_bits()), report.next_critic_loss.map(f64::to_bits));
+        assert_eq!(live.learner.td_loss(a).to_bits(), warm.learner.td_loss(b).to_bits());
+    }
+}
+
+#[test]
+fn a_store_whose_messages_are_not_the_encoders_is_refused_with_the_difference() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = |name: &str, config: TrainConfig| {
+        let store = dir.path().join(format!("store-{name}"));
+        run(config, &dir.path().join(name), &Options { record: Some(&store), ..Options::default() });
+        store
+    };
+    let [observed, narrow] = [store("observed", config("maddpg", 500)), store("narrow", encoded("maddpg", 500))];
+    let refused = |config: TrainConfig, store: &Path| {
+        let options = Options { warm_start: Some(store), ..Options::default() };
+        let out = dir.path().join("out");
+        let error = train(config, &out, &options, &mut |_| {}, &AtomicBool::new(false)).unwrap_err();
+        assert!(!out.exists());
+        error.to_string()
+    };
+    let here = |here: usize, there: usize| {
+        let agent = |message| format!("agent_0 (observation 18, message {message}, action 2)");
+        format!("cannot train on this: agent 0 is {} here and {} in the store", agent(here), agent(there))
+    };
+    let mut wide = encoded("cc-maddpg", 500);
+    wide.maddpg.message_width = Some(9);
+    assert_eq!(refused(wide, &narrow), here(9, 4));
+    assert_eq!(refused(encoded("maddpg", 500), &observed), here(4, 18));
+    assert_eq!(refused(config("maddpg", 500), &narrow), here(18, 4));
+    let options = Options { warm_start: Some(&narrow), ..Options::default() };
+    run(encoded("maddpg", 500), &dir.path().join("fits"), &options);
+    // messages as wide as observations, but an encoder's
+    let mut alike = encoded("maddpg", 500);
+    alike.maddpg.message_width = Some(18);
+    let error = refused(config("maddpg", 500), &store("alike", alike));
+    assert!(error.contains("episode 0: message.agent_0 is not observation.agent_0"), "{error}");
+}
+
+#[test]
+fn an_encoders_gradient_is_logged_and_a_tensor_that_diverged_is_named() {
+    let column = METRIC_COLUMNS.iter().position(|(name, _)| *name == "encoder_grad_norm").unwrap();
+    let norms = |config: TrainConfig| {
+        let mut trainer = Trainer::new(config.resolve().unwrap(), Path::new("unused")).unwrap();
+        while trainer.step() < trainer.config.steps {
+            trainer.advance(None).unwrap();
+        }
+        trainer.metrics().iter().map(|row| row.values[column]).collect::<Vec<_>>()
+    };
+    assert!(norms(encoded("fc-maddpg", 3000)).iter().all(|norm| norm.unwrap() > 0.0));
+    assert!(norms(encoded("maddpg", 3000)).iter().all(|norm| *norm == Some(0.0)));
+    assert!(norms(config("fc-maddpg", 3000)).iter().all(Option::is_none));
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a");
+    run(encoded("fc-maddpg", 1500), &path, &Options::default());
+    let mut trainer = Trainer::new(encoded("fc-maddpg", 1500).resolve().unwrap(), &path).unwrap();
+    trainer.resume().unwrap();
+    for (online, name) in [(false, "target_encoder.agent_1.0.weight"), (true, "encoder.agent_1.0.weight")] {
+        let at = trainer.learner.actors.encoder_range(1).start;
+        let params = &trainer.learner.params;
+        let params = if online { &params.actors } else { &params.target_actors };
+        params.update(|p| p[at] = f32::NAN).unwrap();
+        let before = bytes(&path, "checkpoint/state.safetensors");
+        let error = trainer.save().unwrap_err().to_string();
+        assert!(error.contains(&format!(": {name} is no longer finite; ")), "{error}");
+        assert!(bytes(&path, "checkpoint/state.safetensors") == before, "the last good checkpoint is kept");
+    }
+}
+
+#[test]
+fn what_cannot_be_is_refused_and_what_is_left_out_is_filled_in() {
+    let refused = |set: fn(&mut TrainConfig)| {
+        let mut config = encoded("cc-maddpg", 500);
+        set(&mut config);
+        config.resolve().unwrap_err().to_string()
+    };
+    let width = "maddpg.message_width: it shapes encoders: set messages = \"encoder\", or leave it out";
+    assert_eq!(refused(|c| c.maddpg.messages = Messages::Observation), width);
+    assert_eq!(refused(|c| c.maddpg.messages = Messages::Off), width);
+    let hidden = refused(|c| {
+        (c.maddpg.messages, c.maddpg.message_width) = (Messages::Observation, None);
+        c.maddpg.encoder_hidden = Some(vec![64]);
+    });
+    assert_eq!(hidden, width.replace("message_width", "encoder_hidden"));
+    let range = refused(|c| c.maddpg.message_width = Some(0));
+    assert_eq!(range, "maddpg.message_width: expected 1 to 4096, found 0");
+    let layers = refused(|c| c.maddpg.encoder_hidden = Some(vec![8, 0]));
+    assert_eq!(layers, "maddpg.encoder_hidden: expected at most 16 layers of 1 to 4096 units, found [8, 0]");
+    let alone = refused(|c| c.scenario = Spec::new("simple_spread").with("agents", 1));
+    assert_eq!(alone, "maddpg.messages: an encoder learns through who hears it, found 1 learner: set \"observation\"");
+    let mut plain = config("cc-maddpg", 500);
+    plain.maddpg.messages = Messages::Encoder;
+    let resolved = plain.resolve().unwrap();
+    assert_eq!((resolved.maddpg.message_width, resolved.maddpg.encoder_hidden.clone()), (Some(8), Some(vec![64])));
+    let again: TrainConfig = toml::from_str(&resolved.to_toml().unwrap()).unwrap();
+    assert_eq!(again.clone().resolve().unwrap(), resolved);
+    let text = config("cc-maddpg", 500).resolve().unwrap().to_toml().unwrap();
+    assert!(!text.contains("message_width") && !text.contains("encoder"), "{text}");
+}
