@@ -404,7 +404,7 @@ mod tests {
             let (_, _, passed) = joined(path, &options, PieceSize { rows: 7, bytes: 300 });
             let alone = table(path, &options).unwrap();
             assert_eq!(passed.sample, alone);
-            assert!(alone.len() <= 60 && alone.len() > 40 && alone.x.is_words(0) == false && alone.y.is_words(0));
+            assert!(alone.len() <= 60 && alone.len() > 40 && !alone.x.is_words(0) && alone.y.is_words(0));
             assert!(alone.notes.contains(&"note: estimated on 60 of 200 rows, drawn at random".to_owned()));
             let all = TableOptions { sample: Some(Sample { rows: 1000, ..sample.clone() }), ..options };
             let (whole, drawn) = (table(path, &of("a", "w\nord", &[])).unwrap(), table(path, &all).unwrap());
