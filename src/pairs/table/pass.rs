@@ -429,8 +429,14 @@ mod tests {
         assert!(infinite.starts_with("column \"a\", row 51: infinite or over 1e150"), "{infinite}");
         let mixed = fails(&format!("a,b\n{}{}", lines(50, "1,2"), lines(50, "x,2")));
         assert!(mixed.starts_with("column \"a\" holds both numbers and words, seen from row "), "{mixed}");
-        let mixed = fails(&format!("a,b\n{}{}", lines(50, "x,2"), lines(50, "1,2")));
+        let mixed = fails(&format!("a,b\n{}{}", lines(49, "x,2"), lines(50, "1,2")));
         assert!(mixed.starts_with("column \"a\" holds both numbers and words, seen from row "), "{mixed}");
+        // in the middle of a piece it is a stray cell
+        let stray = fails(&format!("a,b\n{}{}", lines(50, "x,2"), lines(50, "1,2")));
+        assert!(
+            stray.starts_with("column \"a\", row 50: expected a number, as in 9 of 10 rows, found \"x\""),
+            "{stray}"
+        );
         let empty = fails(&format!("a,b\n{}", lines(50, "1,")));
         assert!(empty.starts_with("no rows: all 50 rows have a missing value in a, b"), "{empty}");
         assert!(fails("a,b\n").starts_with("the table has no rows"), "{}", fails("a,b\n"));
