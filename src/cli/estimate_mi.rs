@@ -281,7 +281,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
 /// in time are other columns on one axis only.
 fn view(args: &Args) -> Result<View, Error> {
     if !args.by.is_empty() {
-        return Err(Error::Usage("--plot draws one matrix, or one pair: leave out --by".to_owned()));
+        return Err(Error::Usage("--plot draws one matrix: leave out --by".to_owned()));
     }
     let message = match (args.all_pairs, args.lag.len() > 1) {
         (false, true) => return Ok(View::Lags),
