@@ -14,7 +14,7 @@ use super::plot::{self, View};
 use super::{Outcome, ui};
 use crate::Error;
 use crate::mi::{self, ESTIMATORS, Estimate, Plan, Protocol};
-use crate::pairs::{self, PairsError, TableOptions};
+use crate::pairs::{self, By, Lagging, PairsError, Predicate, TableOptions};
 use crate::registry::{Spec, find};
 use crate::rng::Seeds;
 use crate::schema::Samples;
@@ -34,11 +34,28 @@ Examples:
   ccmarl estimate-mi table.csv --x a --y b --estimator auto --sample 10000
   ccmarl estimate-mi table.csv --x job --y city --estimator discrete --format csv
   ccmarl estimate-mi table.csv --x a --y b --time t --out result.json
+  ccmarl estimate-mi 'data/*.csv' more.feather --x a --y b --group file --estimator gcmi
+  ccmarl estimate-mi table.csv --x a --y b --where \"city <> 'Rome' AND c IS NOT NULL\" --by city
+  ccmarl estimate-mi drive.mcap --x /imu.acceleration.x --y /wheel.speed --time log_time
+  ccmarl estimate-mi data/tag --by sender,step:10 --where 'episode >= 100'
 
 Interrupted (Ctrl-C), it shows and writes the rows that are finished and exits 4.
 For a store: x is the message that the sender sent, y the action of the receiver at the same step, per ordered link,
 delivered and lost apart. Values are in nats unless the unit says jsd. p: episodes permuted.
-In a CSV an empty cell and NaN are missing. Columns of words are categories: discrete and ksg-mixed take them.
+With --by sender, receiver or none, links are pooled: the rows of an episode stay one episode.
+
+A table is CSV, TSV, Parquet, Arrow IPC (file, stream, Feather 2), NPY (columns c0, c1, …, or the
+names of its fields) or MCAP (columns /topic.field.path of JSON and protobuf messages, and log_time;
+columns of two topics are joined where their log times are equal).
+Several files: their rows follow each other; the column file says which one a row is of.
+Text: a column is numbers, true/false, dates or words. Missing are empty cells, NA, N/A, NaN, null,
+and beside numbers or dates also none and -. A stray cell among numbers is an error: --words takes
+the column as words. Columns of words are categories: discrete and ksg-mixed take them.
+Dates (2024-01-31, 2024-01-31T12:00:00.5+01:00) are seconds since the first of them.
+--where: = <> < <= > >=, AND, OR, NOT, BETWEEN, IN (…), IS [NOT] NULL, LIKE, + - * / %, 'text',
+'2024-01-31' beside dates, \"columns with blanks\". A missing cell is NULL, and so is what is divided
+by zero; / never rounds.
+--by: the group of a row tells its part (row, city = Rome; episode, steps 0–9).
 The rows mean:
   auto           one value: chosen by types, ties, width and size, and by what several estimators say
   jsd            2·JSD of the critic, 0 to 2 ln 2: a lower bound on its own scale, not nats
@@ -58,17 +75,18 @@ The rows mean:
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, group(clap::ArgGroup::new("table").args(["x", "all_pairs"]).multiple(true)))]
 pub(super) struct Args {
-    /// A rollout store (directory, .mcap or .parquet), or with --x and --y any CSV, TSV or Parquet table
-    #[arg(value_name = "PATH", value_hint = ValueHint::AnyPath)]
-    path: PathBuf,
+    /// A rollout store (directory, .mcap or .parquet); or, with --x and --y, tables in CSV, TSV, Parquet, Arrow IPC or NPY:
+    /// one, several, or a quoted pattern ('data/*.csv'), whose rows follow each other
+    #[arg(value_name = "PATH", required = true, value_hint = ValueHint::AnyPath)]
+    paths: Vec<PathBuf>,
     #[arg(long, value_name = "NAMES", value_delimiter = ',', default_value = "jsd,club,gaussian", help = estimators())]
     estimator: Vec<String>,
-    /// Table: columns of x, comma-separated; regex:PATTERN, without a comma, is all columns that it matches
-    #[arg(long, value_name = "COLUMNS", value_delimiter = ',')]
-    x: Vec<String>,
-    /// Table: columns of y, comma-separated
-    #[arg(long, value_name = "COLUMNS", value_delimiter = ',', requires = "x")]
-    y: Vec<String>,
+    /// Table: columns of x, comma-separated, or --x again; regex:PATTERN, commas and all, is every column that it matches
+    #[arg(long, value_name = "COLUMNS", value_parser = columns)]
+    x: Vec<Names>,
+    /// Table: columns of y, as --x
+    #[arg(long, value_name = "COLUMNS", value_parser = columns, requires = "x")]
+    y: Vec<Names>,
     /// Table: every pair of the columns --x, or of all columns
     #[arg(long, conflicts_with = "y")]
     all_pairs: bool,
@@ -76,14 +94,24 @@ pub(super) struct Args {
     #[arg(long, value_name = "LAGS", default_value = "0", value_parser = lags)]
     lag: Lags,
     /// Table: columns of z; x and y are compared given z (auto, gaussian, gcmi, ksg1, ksg-mixed, discrete, infonce)
-    #[arg(long, value_name = "COLUMNS", value_delimiter = ',', requires = "table")]
-    given: Vec<String>,
+    #[arg(long, value_name = "COLUMNS", value_parser = columns, requires = "table")]
+    given: Vec<Names>,
     /// Table: rows with the same value in this column are one episode
     #[arg(long, value_name = "COLUMN", requires = "table")]
     group: Option<String>,
     /// Table: column that orders the rows; without --group all rows are one series, cut into blocks
     #[arg(long, value_name = "COLUMN", requires = "table")]
     time: Option<String>,
+    /// Rows to use: an SQL condition over any columns, or over a store's episode, step, sender, receiver, delivered
+    #[arg(long = "where", value_name = "CONDITION")]
+    filter: Option<String>,
+    /// Table: one estimate per value of these columns. Store: sender, receiver, both (the default), none: all others are
+    /// pooled; step:N apart from that: N steps of the episode at a time
+    #[arg(long, value_name = "COLUMNS", value_delimiter = ',')]
+    by: Vec<String>,
+    /// Table: columns whose values are words, even if they look like numbers
+    #[arg(long, value_name = "COLUMNS", value_delimiter = ',', requires = "table")]
+    words: Vec<String>,
     /// Table: estimate from so many rows, drawn at random. A table over --memory is sampled without it (1,000,000 rows),
     /// but for gaussian and discrete, which read all rows once
     #[arg(long, value_name = "N", requires = "table", value_parser = clap::value_parser!(u32).range(10..))]
@@ -136,6 +164,18 @@ pub(super) fn estimators() -> String {
     )
 }
 
+/// Names of columns that were given together.
+type Names = Arc<[String]>;
+
+/// Reads `a,b`, or a pattern, which may have commas in it.
+#[expect(clippy::unnecessary_wraps, reason = "clap's signature")]
+fn columns(text: &str) -> Result<Names, std::convert::Infallible> {
+    if text.starts_with("regex:") {
+        return Ok(Arc::from([text.to_owned()]));
+    }
+    Ok(text.split(',').map(str::to_owned).collect())
+}
+
 /// Rows from x to y.
 type Lags = Arc<[usize]>;
 
@@ -182,7 +222,7 @@ enum Form {
 pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
     end_on_signals()?;
     let plan = plan(args)?;
-    let write = args.out.as_deref().map(|path| writer(path, &args.path, args.force)).transpose()?;
+    let write = args.out.as_deref().map(|path| writer(path, &args.paths, args.force)).transpose()?;
     let plot = args.plot.as_deref().map(|path| Ok((view(args)?, Picture::at(path, args.force)?)));
     let plot = plot.transpose().map_err(|error: Error| error)?;
     let estimators = plan.estimators.len();
@@ -240,6 +280,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
 /// What `--plot` shows. A heat map has one cell per pair: several lags would fall into one, and columns that are moved
 /// in time are other columns on one axis only.
 fn view(args: &Args) -> Result<View, Error> {
+    if !args.by.is_empty() {
+        return Err(Error::Usage("--plot draws one matrix, or one pair: leave out --by".to_owned()));
+    }
     let message = match (args.all_pairs, args.lag.len() > 1) {
         (false, true) => return Ok(View::Lags),
         (false, false) if !args.x.is_empty() => return Ok(View::Pair),
@@ -272,28 +315,25 @@ pub(super) fn named(names: &[String]) -> Result<Vec<mi::Named>, Error> {
 
 /// Samples, or what one pass over a table makes of it that memory does not hold.
 fn input(args: &Args, plan: Plan) -> anyhow::Result<Input> {
-    if args.sample.is_none() && (!args.x.is_empty() || args.all_pairs) && is_large(args)? {
-        if args.lag.iter().any(|&lag| lag > 0) {
-            let message = "--lag needs the rows in memory, and the table is larger than --memory: take a part of it";
-            return Err(Error::Usage(format!("{message}: {}", args.path.display())).into());
+    let of_table_alone = args.all_pairs || (!args.x.is_empty() && !args.y.is_empty());
+    if args.sample.is_none() && of_table_alone {
+        let (paths, mut options) = (pairs::matching(&args.paths).map_err(Error::from)?, options(args)?);
+        if pairs::size(&paths, &options).map_err(Error::from)? > u64::from(args.memory) << 20 {
+            if args.lag.iter().any(|&lag| lag > 0) {
+                let message =
+                    "--lag needs the rows in memory, and the table is larger than --memory: take a part of it";
+                return Err(Error::Usage(format!("{message}: {}", paths[0].display())).into());
+            }
+            options.sample = Some(pairs::Sample { rows: large::SAMPLE, seeds: sample_seeds(args) });
+            let parts = args.all_pairs || args.group.is_some() || args.time.is_some() || !args.by.is_empty();
+            if !parts {
+                return Ok(large::read(&paths, options, plan, args.plot.is_some())?);
+            }
+            let samples = of_table(args, &paths, &options)?;
+            return Ok(Input { samples, plan, places: None, results: Vec::new() });
         }
-        let mut options = options(args);
-        options.sample = Some(pairs::Sample { rows: large::SAMPLE, seeds: sample_seeds(args) });
-        let one_pass = !args.all_pairs && args.group.is_none() && args.time.is_none();
-        if one_pass {
-            return Ok(large::read(&args.path, options, plan, args.plot.is_some())?);
-        }
-        return Ok(Input { samples: of_table(args, &options)?, plan, places: None, results: Vec::new() });
     }
     Ok(Input { samples: samples(args)?, plan, places: None, results: Vec::new() })
-}
-
-fn is_large(args: &Args) -> Result<bool, Error> {
-    if !args.all_pairs && args.y.is_empty() {
-        return Ok(false);
-    }
-    let size = pairs::size(&args.path, &options(args))?;
-    Ok(size.is_some_and(|bytes| bytes > u64::from(args.memory) << 20))
 }
 
 fn sample_seeds(args: &Args) -> Seeds {
@@ -301,15 +341,19 @@ fn sample_seeds(args: &Args) -> Seeds {
 }
 
 /// What the table is asked for.
-fn options(args: &Args) -> TableOptions {
-    TableOptions {
-        x: args.x.clone(),
-        y: args.y.clone(),
-        given: args.given.clone(),
+fn options(args: &Args) -> Result<TableOptions, Error> {
+    let names = |given: &[Names]| given.iter().flat_map(|names| names.iter().cloned()).collect();
+    Ok(TableOptions {
+        x: names(&args.x),
+        y: names(&args.y),
+        given: names(&args.given),
         group: args.group.clone(),
         time: args.time.clone(),
+        words: args.words.clone(),
+        filter: args.filter.as_deref().map(Predicate::parse).transpose()?,
         sample: args.sample.map(|rows| pairs::Sample { rows: rows as usize, seeds: sample_seeds(args) }),
-    }
+        by: args.by.clone(),
+    })
 }
 
 fn samples(args: &Args) -> Result<Vec<Samples>, Error> {
@@ -318,15 +362,27 @@ fn samples(args: &Args) -> Result<Vec<Samples>, Error> {
             "--lag needs neighbouring rows, which --sample takes apart: leave out one".to_owned(),
         ));
     }
-    let sets = unlagged(args)?;
-    let (mut out, mut short) = (Vec::new(), Vec::new());
-    for set in &sets {
-        for &lag in args.lag.iter() {
-            match pairs::lagged(set, lag) {
-                Ok(samples) => out.push(samples),
-                Err(error) => short.push((place(&set.labels), error)),
+    let (sets, by) = unlagged(args)?;
+    let (mut out, mut short, mut lagging) = (Vec::new(), Vec::new(), Lagging::default());
+    let mut lagged = |set: &Samples, lag: usize| match lagging.lagged(set, lag) {
+        Ok(samples) => Some(samples),
+        Err(error) => {
+            short.push((place(&set.labels), error));
+            None
+        }
+    };
+    // pooled links are put together lag by lag; else a link's lags stay together
+    match by {
+        Some(by) => {
+            for &lag in args.lag.iter() {
+                out.extend(by.regroup(sets.iter().filter_map(|set| lagged(set, lag)).collect())?);
             }
         }
+        None => out.extend(
+            sets.iter()
+                .flat_map(|set| args.lag.iter().map(move |&lag| (set, lag)))
+                .filter_map(|(set, lag)| lagged(set, lag)),
+        ),
     }
     if out.is_empty()
         && let Some((_, error)) = short.pop()
@@ -339,35 +395,46 @@ fn samples(args: &Args) -> Result<Vec<Samples>, Error> {
     Ok(out)
 }
 
-fn of_table(args: &Args, options: &TableOptions) -> Result<Vec<Samples>, Error> {
-    if args.all_pairs {
-        let (sets, left_out) = pairs::all_pairs(&args.path, options)?;
-        for what in left_out {
-            ui::say(&format!("note: left out: {what}"));
-        }
-        return Ok(sets);
-    }
-    if options.y.is_empty() {
+fn of_table(args: &Args, paths: &[PathBuf], options: &TableOptions) -> Result<Vec<Samples>, Error> {
+    if options.y.is_empty() && !args.all_pairs {
         return Err(Error::Usage("--x needs --y, or --all-pairs".to_owned()));
     }
-    Ok(vec![pairs::table(&args.path, options)?])
+    let read = if args.all_pairs { pairs::all_pairs } else { pairs::tables };
+    let (sets, left_out) = read(paths, options)?;
+    for what in left_out {
+        ui::say(&format!("note: left out: {what}"));
+    }
+    Ok(sets)
 }
 
-fn unlagged(args: &Args) -> Result<Vec<Samples>, Error> {
-    let path = &args.path;
+/// The samples without a lag; and how links are to be pooled, if they are.
+fn unlagged(args: &Args) -> Result<(Vec<Samples>, Option<By>), Error> {
+    let paths = pairs::matching(&args.paths)?;
     if !args.x.is_empty() || args.all_pairs {
-        return of_table(args, &options(args));
+        return Ok((of_table(args, &paths, &options(args)?)?, None));
+    }
+    let filter = args.filter.as_deref().map(Predicate::parse).transpose()?;
+    let path = &paths[0];
+    if paths.len() > 1 {
+        let message = "several paths are read as tables, with --x and --y; a store is read alone";
+        return Err(Error::Usage(format!("{message}: {}", path.display())));
     }
     if !pairs::is_store(path)? {
         return Err(PairsError::NoColumns(path.clone()).into());
     }
+    let by = By::parse(&args.by)?;
     let mut source = storage::open(path)?;
-    let mut sets = pairs::links(source.as_mut())?;
+    let mut links = pairs::links(source.as_mut())?;
+    if let Some(predicate) = &filter {
+        links.keep(predicate, path)?;
+    }
+    let mut sets = links.sets;
     for (delivered, unwanted) in [(true, args.lost), (false, args.delivered)] {
         sets.retain(|s| !unwanted || s.labels.delivered != Some(delivered));
         if !unwanted && !sets.iter().any(|s| s.labels.delivered == Some(delivered)) {
-            ui::say(&format!("note: the store holds no {} message", class(delivered)));
+            let who = if filter.is_some() { "--where leaves" } else { "the store holds" };
+            ui::say(&format!("note: {who} no {} message", class(delivered)));
         }
     }
-    Ok(sets)
+    Ok((sets, Some(by).filter(|by| !by.is_links())))
 }

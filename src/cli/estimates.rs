@@ -1,7 +1,7 @@
 //! Rows of estimates: how they are printed, which file they go to, and what is said about jobs that gave none.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::outputs::{self, Write};
 use super::ui;
@@ -13,9 +13,9 @@ use crate::{Error, io};
 pub(super) type Failure = (Job, mi::MiError);
 
 /// How the rows are written to a file of this name, which must not hold anything that is not ours.
-pub(super) fn writer(path: &Path, input: &Path, force: bool) -> anyhow::Result<Write<Estimate>> {
+pub(super) fn writer(path: &Path, inputs: &[PathBuf], force: bool) -> anyhow::Result<Write<Estimate>> {
     let real = |p: &Path| p.canonicalize().ok();
-    if real(path).is_some() && real(path) == real(input) {
+    if real(path).is_some() && inputs.iter().any(|input| real(path) == real(input)) {
         let message = format!("--out would replace the input: {}", path.display());
         return Err(Error::Usage(message).into());
     }
@@ -45,17 +45,17 @@ pub(super) fn class(delivered: bool) -> &'static str {
     if delivered { "delivered" } else { "lost" }
 }
 
-/// `agent_0 → agent_1 delivered`, or `a,b → c`.
+/// `agent_0 → agent_1 delivered`, or `a,b → c`; behind a comma, which part of the data.
 pub(super) fn place(labels: &SampleLabels) -> String {
-    match (&labels.sender, &labels.receiver, labels.delivered) {
-        (Some(sender), Some(receiver), Some(delivered)) => {
-            let lag = labels.y.rsplit_once("[+").map_or(String::new(), |(_, lag)| format!(" [+{lag}"));
-            format!("{sender} → {receiver} {}{lag}", class(delivered))
-        }
-        _ => match &labels.given {
-            Some(given) => format!("{} ; {} | {given}", labels.x, labels.y),
-            None => format!("{} ; {}", labels.x, labels.y),
-        },
+    let within = labels.within.as_ref().map_or(String::new(), |within| format!(", {within}"));
+    if let Some(delivered) = labels.delivered {
+        let agent = |agent: &Option<String>| agent.clone().unwrap_or_else(|| "all".to_owned());
+        let lag = labels.y.rsplit_once("[+").map_or(String::new(), |(_, lag)| format!(" [+{lag}"));
+        return format!("{} → {} {}{lag}{within}", agent(&labels.sender), agent(&labels.receiver), class(delivered));
+    }
+    match &labels.given {
+        Some(given) => format!("{} ; {} | {given}{within}", labels.x, labels.y),
+        None => format!("{} ; {}{within}", labels.x, labels.y),
     }
 }
 
@@ -81,7 +81,7 @@ pub(super) fn print(rows: &[Estimate], samples: &[Samples]) -> anyhow::Result<()
     let mut places = rows.iter().map(|row| {
         samples.iter().map(|s| &s.labels).find(|l| {
             (&l.x, &l.y, &l.sender, &l.receiver) == (&row.x, &row.y, &row.sender, &row.receiver)
-                && l.delivered == row.delivered
+                && (l.delivered, &l.group) == (row.delivered, &row.group)
         })
     });
     let mut before = String::new();
@@ -113,7 +113,7 @@ pub(super) fn print(rows: &[Estimate], samples: &[Samples]) -> anyhow::Result<()
         before = here;
     }
     ui::print_table(&["samples", "estimator", "value", "95 % interval", "unit", "p", "n", "n_eff"], &lines)?;
-    if samples.iter().any(|s| s.labels.group == "row") {
+    if samples.iter().any(|s| s.labels.group.split(',').next() == Some("row")) {
         ui::print("each row was taken as independent; give --group or --time if rows belong together")?;
     }
     for (warning, places) in warnings {

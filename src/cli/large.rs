@@ -1,7 +1,7 @@
 //! Tables that memory does not hold: some estimators read all rows once, all others get a random sample.
 
 use std::io::IsTerminal as _;
-use std::path::Path;
+use std::path::PathBuf;
 use std::time::Instant;
 
 use rayon::prelude::*;
@@ -32,7 +32,7 @@ struct Pass {
 }
 
 /// Reads the table once, for the estimators that can do with that. The others, or a picture, get `options.sample`.
-pub(super) fn read(path: &Path, mut options: TableOptions, plan: Plan, picture: bool) -> Result<Input, Error> {
+pub(super) fn read(paths: &[PathBuf], mut options: TableOptions, plan: Plan, picture: bool) -> Result<Input, Error> {
     let (mut passes, mut rest, mut places) = (Vec::new(), Vec::new(), Vec::new());
     for (place, named) in plan.estimators.into_iter().enumerate() {
         match named.1.one_pass() {
@@ -48,7 +48,7 @@ pub(super) fn read(path: &Path, mut options: TableOptions, plan: Plan, picture: 
     }
     let bar = ui::progress(0, "reading rows");
     let (plain, started, mut said) = (!std::io::stderr().is_terminal(), Instant::now(), Instant::now());
-    let passed = pairs::pass(path, &options, PieceSize::default(), &mut |piece, progress| {
+    let passed = pairs::pass(paths, &options, PieceSize::default(), &mut |piece, progress| {
         passes.par_iter_mut().for_each(|pass| pass.add(piece));
         bar.set_length(progress.of.unwrap_or(progress.rows));
         bar.set_position(progress.rows);

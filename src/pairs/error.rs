@@ -89,7 +89,7 @@ pub enum PairsError {
         path: PathBuf,
     },
     /// A column that holds no numbers.
-    #[error("column {name:?} holds {kind}, expected integers, floats or booleans; {hint}: {}", path.display())]
+    #[error("column {name:?} holds {kind}, expected numbers, booleans, dates or words; {hint}: {}", path.display())]
     NotNumeric {
         /// Column.
         name: String,
@@ -128,12 +128,17 @@ pub enum PairsError {
         path: PathBuf,
     },
     /// A number whose square is infinite.
-    #[error("column {name:?}, row {row}: infinite or over 1e150; remove the row or rescale the column: {}", path.display())]
+    #[error(
+        "column {name:?}, row {row}: infinite or over 1e150 ({value:e}); leave it out with --where, or rescale the column: {}",
+        path.display()
+    )]
     Infinite {
         /// Column.
         name: String,
         /// 1-based row of data.
         row: usize,
+        /// What stands there.
+        value: f64,
         /// File.
         path: PathBuf,
     },
@@ -147,10 +152,122 @@ pub enum PairsError {
         /// File.
         path: PathBuf,
     },
+    /// A directory where a table should be.
+    #[error(
+        "it is a directory, and no table: a store is read without --x and --y; of another directory name the files: {}",
+        .0.display()
+    )]
+    Directory(PathBuf),
+    /// A file without a row.
+    #[error("the table has no rows: {}", .0.display())]
+    EmptyTable(PathBuf),
+    /// A condition that is none.
+    #[error("--where {text:?}: {message}")]
+    Where {
+        /// The condition.
+        text: String,
+        /// What was expected and found.
+        message: String,
+    },
+    /// A condition that is true of no row.
+    #[error("no rows: --where {predicate:?} keeps none of the {rows} rows: {}", path.display())]
+    NothingKept {
+        /// The condition.
+        predicate: String,
+        /// Rows in the file.
+        rows: usize,
+        /// File.
+        path: PathBuf,
+    },
+    /// A cell that is not like the others of its column.
+    #[error(
+        "column {name:?}, row {row}: expected {expected}, found {found:?}; leave the cell empty or write NA where a value is missing, leave rows out with --where, or give --words {name} to take all of them as words: {}",
+        path.display()
+    )]
+    Stray {
+        /// Column.
+        name: String,
+        /// 1-based row of data.
+        row: usize,
+        /// What stands there.
+        found: String,
+        /// What most cells are, and how many.
+        expected: String,
+        /// File.
+        path: PathBuf,
+    },
+    /// A date beside others that have nanoseconds.
+    #[error(
+        "column {name:?}, row {row}: a date that nanoseconds do not reach (1677 to 2262), and other rows have such: {}",
+        path.display()
+    )]
+    Far {
+        /// Column.
+        name: String,
+        /// 1-based row of data.
+        row: usize,
+        /// File.
+        path: PathBuf,
+    },
+    /// A column of words that should order rows.
+    #[error("--time {name:?} holds words, expected numbers or dates such as 2024-01-31T12:00:00Z: {}", path.display())]
+    NoTime {
+        /// Column.
+        name: String,
+        /// File.
+        path: PathBuf,
+    },
+    /// A column that holds other things in another file.
+    #[error(
+        "column {name:?} holds {found}: --words {name} takes both as words: {}",
+        path.display()
+    )]
+    Types {
+        /// Column.
+        name: String,
+        /// Its type here, and in the first file.
+        found: String,
+        /// File.
+        path: PathBuf,
+    },
+    /// Too many sets of samples.
+    #[error("--by {by}: more than {most} values: name a column with fewer: {}", path.display())]
+    TooManyParts {
+        /// Columns.
+        by: String,
+        /// Most values.
+        most: usize,
+        /// File.
+        path: PathBuf,
+    },
+    /// A word of `--by` that is none.
+    #[error("--by {0:?}: of a store expected sender, receiver, none (all links pooled) or step:N")]
+    By(String),
+    /// Too many ranges of steps.
+    #[error("--by step:{steps}: more than {most} ranges: give more steps each")]
+    TooManySteps {
+        /// Steps of each.
+        steps: usize,
+        /// Most ranges.
+        most: usize,
+    },
+    /// A line that no table has.
+    #[error("line {line} is longer than {limit} bytes: not a table? {}", path.display())]
+    LongLine {
+        /// 1-based line.
+        line: u64,
+        /// Longest line, bytes.
+        limit: usize,
+        /// File.
+        path: PathBuf,
+    },
+    /// No file is meant.
+    #[error("{0}")]
+    NoFiles(String),
     /// The file is not what its name says.
     #[error("not a readable {form} table: {message}: {}", path.display())]
     Unreadable {
-        /// `CSV`, `TSV` or `Parquet`.
+        /// The form's name.
         form: &'static str,
         /// What the reader said.
         message: String,
@@ -162,6 +279,16 @@ pub enum PairsError {
 impl PairsError {
     /// Whether the user's words are at fault, not the data.
     pub fn is_usage(&self) -> bool {
-        matches!(self, Self::UnknownColumn { .. } | Self::NotNumeric { .. } | Self::NoColumns(_) | Self::Pattern { .. })
+        matches!(
+            self,
+            Self::UnknownColumn { .. }
+                | Self::NotNumeric { .. }
+                | Self::NoColumns(_)
+                | Self::Pattern { .. }
+                | Self::Where { .. }
+                | Self::NoFiles(_)
+                | Self::NoTime { .. }
+                | Self::By(_)
+        )
     }
 }

@@ -1,52 +1,76 @@
 //! The same samples with y some rows later.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::PairsError;
-use crate::schema::{Columns, Exchange, Samples};
+use crate::schema::{Columns, Exchange, NOTE, Samples};
 
-/// Pairs each x (and z) with the y that stands `lag` rows later in the same episode; rows without such a y are no samples.
-/// One series is one episode here, whatever blocks it is cut into.
-///
-/// # Errors
-/// [`PairsError::NoLag`] when no sample has so many rows after it in its episode.
-pub fn lagged(samples: &Samples, lag: usize) -> Result<Samples, PairsError> {
-    if lag == 0 {
-        return Ok(samples.clone());
+/// Moves y in time. What was moved once is shared by all samples of the same columns: every link of a receiver.
+#[derive(Debug, Default)]
+pub struct Lagging {
+    /// By column and lag; the columns themselves are kept, so that no other can take their place.
+    moved: BTreeMap<(usize, usize), (Arc<Columns>, Arc<Columns>)>,
+}
+
+impl Lagging {
+    /// Pairs each x (and z) with the y that stands `lag` rows later in the same episode; rows without such a y are no
+    /// samples. One series is one episode here, whatever blocks it is cut into.
+    ///
+    /// # Errors
+    /// [`PairsError::NoLag`] when no sample has so many rows after it in its episode.
+    pub fn lagged(&mut self, samples: &Samples, lag: usize) -> Result<Samples, PairsError> {
+        if lag == 0 {
+            return Ok(samples.clone());
+        }
+        let count = samples.y.rows();
+        let ends = samples.episodes().into_iter().map(|episode| match samples.exchange {
+            Exchange::Episodes => samples.starts[episode as usize + 1],
+            Exchange::Shift => count,
+        });
+        let within = samples.rows.iter().zip(ends).filter(|&(&r, end)| r as usize + lag < end);
+        let rows: Vec<u32> = within.map(|(&r, _)| r).collect();
+        if rows.is_empty() {
+            return Err(too_short(samples, lag));
+        }
+        let place = (Arc::as_ptr(&samples.y) as usize, lag);
+        let moved =
+            self.moved.entry(place).or_insert_with(|| (Arc::clone(&samples.y), Arc::new(later(&samples.y, lag))));
+        let mut out = Samples { y: Arc::clone(&moved.1), rows, ..samples.clone() };
+        out.labels.y = format!("{}[+{lag}]", samples.labels.y);
+        if samples.notes.iter().any(|note| !note.starts_with(NOTE)) {
+            out.notes.push(format!("{NOTE}lag {lag} counts the rows that are left"));
+        }
+        Ok(out)
     }
-    let (width, count) = (samples.y.width(), samples.y.rows());
-    let ends = samples.episodes().into_iter().map(|episode| match samples.exchange {
-        Exchange::Episodes => samples.starts[episode as usize + 1],
-        Exchange::Shift => count,
-    });
-    let within = samples.rows.iter().zip(ends).filter(|&(&r, end)| r as usize + lag < end);
-    let rows: Vec<u32> = within.map(|(&r, _)| r).collect();
-    if rows.is_empty() {
-        let longest = samples.starts.windows(2).map(|w| w[1] - w[0]).max().unwrap_or(0);
-        let longest = if samples.exchange == Exchange::Shift { count } else { longest };
-        // a store says itself what its episodes are
-        let of_store = samples.labels.sender.is_some();
-        let remedy = if of_store { "give a smaller --lag" } else { "give --time or --group, or a smaller --lag" };
-        return Err(PairsError::NoLag { lag, longest, samples: samples.rows.len(), remedy });
+}
+
+/// The rows `lag` later. The last rows have none: they are no samples, and what stands there is never read.
+fn later(y: &Columns, lag: usize) -> Columns {
+    let mut data = Vec::with_capacity(y.data.len());
+    for r in 0..y.rows() {
+        data.extend_from_slice(y.row((r + lag).min(y.rows() - 1)));
     }
-    // the last rows have no y of their own later on: they are no samples, and what stands there is never read
-    let mut data = Vec::with_capacity(count * width);
-    for r in 0..count {
-        data.extend_from_slice(samples.y.row((r + lag).min(count - 1)));
-    }
-    let y = Columns { data, names: samples.y.names.clone(), words: samples.y.words.clone() };
-    let mut out = Samples { y: Arc::new(y), rows, ..samples.clone() };
-    out.labels.y = format!("{}[+{lag}]", samples.labels.y);
-    if !samples.notes.is_empty() {
-        out.notes.push(format!("lag {lag} counts the rows that are left"));
-    }
-    Ok(out)
+    Columns { data, names: y.names.clone(), words: y.words.clone() }
+}
+
+fn too_short(samples: &Samples, lag: usize) -> PairsError {
+    let longest = samples.starts.windows(2).map(|w| w[1] - w[0]).max().unwrap_or(0);
+    let longest = if samples.exchange == Exchange::Shift { samples.y.rows() } else { longest };
+    // a store says itself what its episodes are
+    let of_store = samples.labels.sender.is_some();
+    let remedy = if of_store { "give a smaller --lag" } else { "give --time or --group, or a smaller --lag" };
+    PairsError::NoLag { lag, longest, samples: samples.rows.len(), remedy }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::schema::SampleLabels;
+
+    fn lagged(samples: &Samples, lag: usize) -> Result<Samples, PairsError> {
+        Lagging::default().lagged(samples, lag)
+    }
 
     fn samples(exchange: Exchange) -> Samples {
         let columns =
@@ -90,5 +114,14 @@ mod tests {
     fn blocks_of_one_series_are_no_edges() {
         assert_eq!(lagged(&samples(Exchange::Shift), 3).unwrap().rows, [0, 2, 3, 4, 5]);
         assert!(lagged(&samples(Exchange::Shift), 9).is_err());
+    }
+
+    #[test]
+    fn what_was_moved_once_is_shared() {
+        let (one, mut lagging) = (samples(Exchange::Episodes), Lagging::default());
+        let other = Samples { rows: vec![0, 1], x: Arc::clone(&one.y), ..one.clone() };
+        let [a, b, c] = [(&one, 2), (&other, 2), (&one, 1)].map(|(set, lag)| lagging.lagged(set, lag).unwrap());
+        assert!(Arc::ptr_eq(&a.y, &b.y) && !Arc::ptr_eq(&a.y, &c.y));
+        assert_eq!((a.y.row(0), c.y.row(0)), (&[102.0][..], &[101.0][..]));
     }
 }

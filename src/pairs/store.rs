@@ -1,9 +1,12 @@
 //! Samples per ordered link of a store.
 
+use std::path::Path;
 use std::sync::Arc;
 
-use super::PairsError;
-use crate::schema::{Columns, Exchange, Layout, SampleLabels, Samples};
+use super::predicate::{Kind, Value};
+use super::{PairsError, Predicate};
+use crate::registry::did_you_mean;
+use crate::schema::{Columns, Exchange, Layout, NOTE, SampleLabels, Samples};
 use crate::storage::EpisodeSource;
 
 /// Columns of one agent over all episodes, in the making.
@@ -28,6 +31,69 @@ impl Track {
     }
 }
 
+/// The links of a store.
+#[derive(Clone, Debug)]
+pub struct Links {
+    /// One set of samples per ordered link and class.
+    pub sets: Vec<Samples>,
+    /// The number in the store of each episode of the samples: those without a step are not among them.
+    pub episodes: Vec<u64>,
+}
+
+impl Links {
+    /// Leaves out the samples of which a predicate over `episode`, `step`, `sender`, `receiver` and `delivered` is not
+    /// true, and sets without a sample.
+    ///
+    /// # Errors
+    /// [`PairsError::UnknownColumn`], [`PairsError::Where`], [`PairsError::NothingKept`].
+    pub fn keep(&mut self, predicate: &Predicate, path: &Path) -> Result<(), PairsError> {
+        const COLUMNS: [(&str, Kind); 5] = [
+            ("episode", Kind::Number),
+            ("step", Kind::Number),
+            ("sender", Kind::Text),
+            ("receiver", Kind::Text),
+            ("delivered", Kind::Truth),
+        ];
+        let place = |name: &String| {
+            COLUMNS.iter().position(|(column, _)| column == name).ok_or_else(|| PairsError::UnknownColumn {
+                name: name.clone(),
+                hint: did_you_mean(name, COLUMNS.iter().map(|(column, _)| *column)),
+                path: path.to_owned(),
+            })
+        };
+        let places = predicate.columns().iter().map(place).collect::<Result<Vec<_>, _>>()?;
+        let kinds: Vec<Kind> = places.iter().map(|&place| COLUMNS[place].1).collect();
+        let bound = predicate.bind(&kinds)?;
+        let before: usize = self.sets.iter().map(Samples::len).sum();
+        for set in &mut self.sets {
+            let (labels, starts) = (&set.labels, &set.starts);
+            let text = |text: &'_ Option<String>| text.clone().unwrap_or_default();
+            let (sender, receiver) = (text(&labels.sender), text(&labels.receiver));
+            let wanted = |(&row, &episode): (&u32, &u32)| {
+                let cell = |column: usize| match COLUMNS[places[column]].0 {
+                    "episode" => Value::Integer(self.episodes[episode as usize] as i64),
+                    "step" => Value::Integer(i64::from(row) - starts[episode as usize] as i64),
+                    "sender" => Value::Text(&sender),
+                    "receiver" => Value::Text(&receiver),
+                    _ => labels.delivered.map_or(Value::Null, Value::Truth),
+                };
+                bound.keeps(&cell)
+            };
+            let episodes = set.episodes();
+            set.rows = set.rows.iter().zip(&episodes).filter(|&pair| wanted(pair)).map(|(&row, _)| row).collect();
+        }
+        self.sets.retain(|set| !set.is_empty());
+        let left: usize = self.sets.iter().map(Samples::len).sum();
+        if left == 0 {
+            let predicate = predicate.text().to_owned();
+            return Err(PairsError::NothingKept { predicate, rows: before, path: path.to_owned() });
+        }
+        let note = format!("{NOTE}{left} of {before} messages kept by --where {}", predicate.text());
+        self.sets.iter_mut().for_each(|set| set.notes.push(note.clone()));
+        Ok(())
+    }
+}
+
 /// One set of samples per ordered link and class that occurs, links sender-major, delivered before lost.
 ///
 /// x is the message that the sender **sent** at step t, `[rows, message]`, y the action of the receiver at t,
@@ -36,7 +102,7 @@ impl Track {
 ///
 /// # Errors
 /// [`PairsError::NoLinks`], [`PairsError::NoSteps`], [`PairsError::StoreValue`], and those of the store.
-pub fn links(source: &mut dyn EpisodeSource) -> Result<Vec<Samples>, PairsError> {
+pub fn links(source: &mut dyn EpisodeSource) -> Result<Links, PairsError> {
     let layout = source.manifest().layout();
     let communicators = layout.communicators();
     let links = usable_links(&layout);
@@ -52,7 +118,7 @@ pub fn links(source: &mut dyn EpisodeSource) -> Result<Vec<Samples>, PairsError>
         .map(|&a| Track::new(format!("action.{}", layout.agents[a].name), layout.agents[a].action))
         .collect();
     let (mut starts, mut classes) = (vec![0], vec![[Vec::new(), Vec::new()]; links.len()]);
-    let mut rows = 0;
+    let (mut rows, mut episodes) = (0, Vec::new());
     while let Some(episode) = source.next_episode()? {
         let steps = episode.steps;
         if steps == 0 {
@@ -74,6 +140,7 @@ pub fn links(source: &mut dyn EpisodeSource) -> Result<Vec<Samples>, PairsError>
         }
         rows += steps;
         starts.push(rows);
+        episodes.push(episode.index);
     }
     if rows == 0 {
         return Err(PairsError::NoSteps { episodes: source.manifest().episodes });
@@ -97,6 +164,7 @@ pub fn links(source: &mut dyn EpisodeSource) -> Result<Vec<Samples>, PairsError>
                 receiver: Some(layout.agents[communicators[r]].name.clone()),
                 delivered: Some(delivered),
                 group: "episode".to_owned(),
+                within: None,
             };
             out.push(Samples {
                 x: Arc::clone(&sent[s].0),
@@ -110,7 +178,7 @@ pub fn links(source: &mut dyn EpisodeSource) -> Result<Vec<Samples>, PairsError>
             });
         }
     }
-    Ok(out)
+    Ok(Links { sets: out, episodes })
 }
 
 /// Ordered pairs of communicators, by their places among the communicators, whose sender sends and receiver acts.
@@ -121,14 +189,14 @@ fn usable_links(layout: &Layout) -> Vec<(usize, usize)> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use serde_json::Value;
 
     use super::*;
     use crate::schema::{AgentSpec, Controller, Episode, Manifest, Matrix};
     use crate::storage::StorageError;
 
-    struct Memory {
+    pub(in crate::pairs) struct Memory {
         manifest: Manifest,
         episodes: std::vec::IntoIter<Episode>,
     }
@@ -144,7 +212,7 @@ mod tests {
     }
 
     /// `agents` communicators; agent a sends 100 e + 10 t + a and acts [that, −that]; odd steps are lost from 0 to 1.
-    fn store(agents: usize, lengths: &[usize]) -> Memory {
+    pub(in crate::pairs) fn store(agents: usize, lengths: &[usize]) -> Memory {
         let spec = |a: usize| AgentSpec {
             name: format!("agent_{a}"),
             team: "team".to_owned(),
@@ -179,7 +247,7 @@ mod tests {
 
     #[test]
     fn every_link_and_class_has_its_rows_and_the_last_row_is_left_out() {
-        let sets = links(&mut store(2, &[3, 2])).unwrap();
+        let sets = links(&mut store(2, &[3, 2])).unwrap().sets;
         let named: Vec<_> = sets
             .iter()
             .map(|s| (s.labels.sender.as_deref().unwrap(), s.labels.delivered.unwrap(), s.rows.clone()))

@@ -10,7 +10,7 @@ use polars::prelude::{Column, CsvReadOptions, DataFrame, DataType, ParquetReader
 use crate::io::IoError;
 use crate::link::Trace;
 use crate::registry::{RegistryError, did_you_mean};
-use crate::storage::{self, EpisodeSource};
+use crate::storage::{self, EpisodeSource, TableForm};
 
 /// Columns of a table of link bits.
 const COLUMNS: [&str; 5] = ["episode", "step", "sender", "receiver", "delivered"];
@@ -34,7 +34,7 @@ pub fn read_trace(path: &Path) -> Result<Trace, RegistryError> {
     }
     let form = form(path)?;
     if form == PARQUET {
-        storage::check_table(path).map_err(|e| data(&e))?;
+        storage::check_table(path, TableForm::Parquet).map_err(|e| data(&e))?;
     }
     let (sha256, _) = crate::io::sha256_file(path).map_err(|e| data(&e))?;
     let table = Table::read(path, form)?;
@@ -56,7 +56,10 @@ pub fn is_link_table(path: &Path) -> Result<bool, RegistryError> {
 
 /// `CSV`, `TSV` or [`PARQUET`].
 fn form(path: &Path) -> Result<&'static str, RegistryError> {
-    storage::table_form(path).map(storage::TableForm::name).map_err(|e| data(&e))
+    match storage::table_form(path).map_err(|e| data(&e))? {
+        form @ (TableForm::Csv | TableForm::Tsv | TableForm::Parquet) => Ok(form.name()),
+        form => Err(refused(&format!("expected a CSV, TSV or Parquet table, found {}", form.name()), path)),
+    }
 }
 
 /// How text of this form is read: every cell as text, so that what is wrong with it can be said.

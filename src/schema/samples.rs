@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-/// What a note begins with that explains and does not warn.
+/// What a note begins with that is no warning.
 pub const NOTE: &str = "note: ";
 
 /// A row-major `f64` matrix with named columns.
@@ -67,8 +67,11 @@ pub struct SampleLabels {
     pub receiver: Option<String>,
     /// Whether the messages arrived.
     pub delivered: Option<bool>,
-    /// What one episode is: `episode` of a store, a column's name, `blocks of <time>`, or `row`.
+    /// What one episode is: `episode` of a store, a column's name, `blocks of <time>`, or `row`; behind a comma, which
+    /// part of the data the samples are, if they are one.
     pub group: String,
+    /// That part: `species = setosa`, `steps 0–9`.
+    pub within: Option<String>,
 }
 
 /// Samples of (x, y) in episodes. The columns also hold the rows between the samples (messages of the other class),

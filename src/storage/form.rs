@@ -15,6 +15,14 @@ pub enum TableForm {
     Tsv,
     /// Parquet.
     Parquet,
+    /// Arrow IPC with a footer (Feather 2).
+    IpcFile,
+    /// Arrow IPC as a stream of messages.
+    IpcStream,
+    /// One `NumPy` array.
+    Npy,
+    /// MCAP.
+    Mcap,
 }
 
 impl TableForm {
@@ -24,9 +32,34 @@ impl TableForm {
             Self::Csv => "CSV",
             Self::Tsv => "TSV",
             Self::Parquet => "Parquet",
+            Self::IpcFile => "Arrow IPC",
+            Self::IpcStream => "Arrow IPC stream",
+            Self::Npy => "NPY",
+            Self::Mcap => "MCAP",
         }
     }
 }
+
+/// How a form begins.
+const FIRST_BYTES: [(&[u8], TableForm); 5] = [
+    (b"PAR1", TableForm::Parquet),
+    (b"ARROW1", TableForm::IpcFile),
+    (&[0xff; 4], TableForm::IpcStream),
+    (b"\x93NUMPY", TableForm::Npy),
+    (b"\x89MCAP0\r\n", TableForm::Mcap),
+];
+
+/// How the names of a form end.
+const ENDINGS: [(&str, TableForm); 8] = [
+    ("parquet", TableForm::Parquet),
+    ("tsv", TableForm::Tsv),
+    ("tab", TableForm::Tsv),
+    ("arrow", TableForm::IpcFile),
+    ("ipc", TableForm::IpcFile),
+    ("feather", TableForm::IpcFile),
+    ("npy", TableForm::Npy),
+    ("mcap", TableForm::Mcap),
+];
 
 /// The form of a file: by its first bytes, else by the ending of its name.
 ///
@@ -36,12 +69,8 @@ pub fn table_form(path: &Path) -> Result<TableForm, IoError> {
     let mut magic = Vec::new();
     let file = File::open(path).map_err(IoError::os("open", path))?;
     file.take(8).read_to_end(&mut magic).map_err(IoError::os("read", path))?;
-    let named = |extension: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(extension));
-    Ok(if magic.starts_with(b"PAR1") || named("parquet") {
-        TableForm::Parquet
-    } else if named("tsv") || named("tab") {
-        TableForm::Tsv
-    } else {
-        TableForm::Csv
-    })
+    let begins = FIRST_BYTES.iter().find(|(first, _)| magic.starts_with(first)).map(|(_, form)| *form);
+    let ending = path.extension().map(|e| e.to_string_lossy().to_lowercase()).unwrap_or_default();
+    let ends = ENDINGS.iter().find(|(name, _)| *name == ending).map(|(_, form)| *form);
+    Ok(begins.or(ends).unwrap_or(TableForm::Csv))
 }

@@ -28,13 +28,17 @@
 
 mod assembler;
 mod diagnose;
+mod fields;
 mod proto;
 mod sink;
 mod source;
 mod tail;
+mod topics;
 mod viewer;
 
 use std::path::Path;
+
+pub use topics::{Cell, TopicColumn, topic_columns, topic_names};
 
 use super::{EpisodeSink, EpisodeSource, Format, Options, StorageError};
 use crate::registry::Entry;

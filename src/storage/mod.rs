@@ -4,6 +4,7 @@
 
 mod convert;
 mod form;
+mod ipc;
 mod lock;
 mod mcap;
 mod names;
@@ -28,6 +29,7 @@ use verify::Findings;
 pub use convert::convert;
 pub use form::{TableForm, table_form};
 pub use lock::Owner;
+pub use mcap::{Cell, TopicColumn, topic_columns, topic_names};
 pub use names::refuse_within_store;
 pub use recover::{Recovered, left_beside, recover};
 pub use rescue::{Rescued, rescue};
@@ -309,13 +311,18 @@ pub fn open(path: &Path) -> Result<Box<dyn EpisodeSource>, StorageError> {
     Ok(source)
 }
 
-/// Checks a Parquet file before its columns are read as a table: the digest, when it is a store or a part of one, and
-/// that no page asks for an absurd amount of memory.
+/// Checks a file before its columns are read as a table by a reader that believes it: of Parquet the digest, when it is
+/// a store or a part of one, and that no page asks for an absurd amount of memory; of Arrow IPC that no length does.
+/// Other forms are not checked.
 ///
 /// # Errors
 /// [`StorageError::Damaged`].
-pub fn check_table(path: &Path) -> Result<(), StorageError> {
-    parquet::check_table(path)
+pub fn check_table(path: &Path, form: TableForm) -> Result<(), StorageError> {
+    match form {
+        TableForm::Parquet => parquet::check_table(path),
+        TableForm::IpcFile | TableForm::IpcStream => ipc::check(path, form == TableForm::IpcStream),
+        _ => Ok(()),
+    }
 }
 
 /// The first format that claims the path; Parquet when none does.

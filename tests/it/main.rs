@@ -27,6 +27,7 @@ mod shaping;
 mod signals;
 mod stats;
 mod stores;
+mod table_forms;
 mod train;
 mod train_runs;
 mod worlds;

@@ -138,8 +138,8 @@ fn every_error_of_recordings_and_samples_says_what_to_do() {
         ),
         (PairsError::TooManyRows.to_string(), "more than 4294967295 rows: take a part of the data"),
         (
-            PairsError::Infinite { name: "a".to_owned(), row: 3, path: path() }.to_string(),
-            "column \"a\", row 3: infinite or over 1e150; remove the row or rescale the column: data/x",
+            PairsError::Infinite { name: "a".to_owned(), row: 3, value: f64::INFINITY, path: path() }.to_string(),
+            "column \"a\", row 3: infinite or over 1e150 (inf); leave it out with --where, or rescale the column: data/x",
         ),
         (
             PairsError::Unreadable { form: "CSV", message: "…".to_owned(), path: path() }.to_string(),

@@ -5,13 +5,15 @@
 use std::fs::File;
 use std::path::Path;
 
-use polars::prelude::{DataFrame, PolarsError};
+use polars::prelude::{ArrowDataType, ArrowField, DataFrame, PolarsError};
 
+use super::ipc::Ipc;
+use super::npy::Npy;
 use super::parquet::Parquet;
 use super::text::Text;
+use super::topics::Topics;
 use crate::io::IoError;
 use crate::pairs::PairsError;
-use crate::registry::did_you_mean;
 use crate::storage::{TableForm, table_form};
 
 /// One foreign file of named columns.
@@ -19,7 +21,12 @@ pub(super) trait TableFile {
     /// The names of its columns, in its order.
     fn names(&self) -> Result<Vec<String>, PairsError>;
 
-    /// Columns that it has, each name once.
+    /// The columns among them of a type that no reader here takes, each with that type.
+    fn unusable(&self) -> Result<Vec<(String, String)>, PairsError> {
+        Ok(Vec::new())
+    }
+
+    /// Columns that it has, each name once; the cells of text as they stand there.
     fn read(&self, columns: &[&str]) -> Result<DataFrame, PairsError>;
 
     /// Bytes that these columns take in memory, about; `None` where only reading tells.
@@ -64,6 +71,9 @@ pub(super) fn caught<T>(
     if !path.exists() {
         return Err(IoError::Missing(path.to_owned()).into());
     }
+    if path.is_dir() {
+        return Err(PairsError::Directory(path.to_owned()));
+    }
     let form = table_form(path)?;
     guarded(path, form, || read(opened(path, form)?.as_ref()))
 }
@@ -82,23 +92,54 @@ pub(super) fn guarded<T>(
 
 fn opened(path: &Path, form: TableForm) -> Result<Box<dyn TableFile>, PairsError> {
     Ok(match form {
-        TableForm::Csv => Box::new(Text::new(path, form, b',')),
-        TableForm::Tsv => Box::new(Text::new(path, form, b'\t')),
+        TableForm::Csv => Box::new(Text::new(path, form, b',')?),
+        TableForm::Tsv => Box::new(Text::new(path, form, b'\t')?),
         TableForm::Parquet => Box::new(Parquet::new(path)?),
+        TableForm::IpcFile | TableForm::IpcStream => Box::new(Ipc::new(path, form)?),
+        TableForm::Npy => Box::new(Npy::new(path)?),
+        TableForm::Mcap => Box::new(Topics::new(path)),
     })
 }
 
-/// The wanted columns of a file, which must have them.
-pub(super) fn wanted(file: &dyn TableFile, path: &Path, wanted: &[&str]) -> Result<DataFrame, PairsError> {
-    let names = file.names()?;
-    if let Some(&name) = wanted.iter().find(|w| !names.iter().any(|n| n == *w)) {
-        let hint = did_you_mean(name, names.iter().map(String::as_str));
-        return Err(PairsError::UnknownColumn { name: name.to_owned(), hint, path: path.to_owned() });
+/// The columns of a schema whose type makes polars panic: decimals, half floats, structures and the like.
+pub(super) fn unusable<'a>(fields: impl Iterator<Item = &'a ArrowField>) -> Vec<(String, String)> {
+    let of = |field: &ArrowField| (field.name.to_string(), format!("{:?}", field.dtype));
+    fields.filter(|field| !is_usable(&field.dtype)).map(of).collect()
+}
+
+fn is_usable(kind: &ArrowDataType) -> bool {
+    use ArrowDataType as Type;
+    match kind {
+        Type::List(inner) | Type::LargeList(inner) | Type::FixedSizeList(inner, _) => is_usable(&inner.dtype),
+        Type::Dictionary(_, inner, _) => is_usable(inner),
+        other => matches!(
+            other,
+            Type::Null
+                | Type::Boolean
+                | Type::Float32
+                | Type::Float64
+                | Type::Int8
+                | Type::Int16
+                | Type::Int32
+                | Type::Int64
+                | Type::UInt8
+                | Type::UInt16
+                | Type::UInt32
+                | Type::UInt64
+                | Type::Timestamp(..)
+                | Type::Date32
+                | Type::Date64
+                | Type::Time32(_)
+                | Type::Time64(_)
+                | Type::Duration(_)
+                | Type::Binary
+                | Type::LargeBinary
+                | Type::BinaryView
+                | Type::Utf8
+                | Type::LargeUtf8
+                | Type::Utf8View
+        ),
     }
-    let mut columns: Vec<&str> = wanted.to_vec();
-    columns.sort_unstable();
-    columns.dedup();
-    file.read(&columns)
 }
 
 /// The file, open.

@@ -1,38 +1,44 @@
-//! Samples from named columns of anybody's table.
+//! Samples from named columns of anybody's tables.
 //!
-//! [`form`] reads a file, whatever its form, whole or in pieces; [`pass`] goes over the pieces once, [`sample`] draws rows; [`names`] says which columns are meant; [`numbers`] makes numbers of them;
-//! [`order`] puts rows into episodes.
+//! [`form`] reads a file, whatever its form; [`cells`] says what its text is; [`names`] which columns are meant;
+//! [`several`] makes one table of several files; [`numbers`] makes numbers of columns; [`order`] puts rows into episodes;
+//! [`chosen`] makes samples of them. [`pass`] does all this piece by piece, and [`sample`] draws rows meanwhile.
 
+mod cells;
+mod chosen;
 mod form;
+mod ipc;
 mod lines;
 mod names;
+mod npy;
 mod numbers;
 mod order;
 mod parquet;
 mod pass;
+mod rows;
 mod sample;
+mod several;
 mod text;
+mod topics;
 
-use std::path::Path;
-use std::sync::Arc;
+use std::path::{Path, PathBuf};
 
-use polars::prelude::{DataFrame, DataType};
-
+use self::chosen::Chosen;
 pub use self::form::PieceSize;
-use self::form::{TableFile, caught, guarded};
-use self::names::expanded;
-use self::numbers::{is_numeric, numbers};
-use self::order::{Order, episodes, texts};
+use self::form::guarded;
+use self::numbers::Holds;
+use self::parquet::is_store as is_parquet_store;
 pub use self::pass::{Passed, Progress, pass, size};
-use self::sample::Drawn;
 pub use self::sample::Sample;
-use super::PairsError;
+use self::several::Table;
+use super::{PairsError, Predicate};
 use crate::io::IoError;
-use crate::schema::{Columns, Exchange, NOTE, SampleLabels, Samples};
+use crate::schema::Samples;
 use crate::storage::{TableForm, table_form};
 
-/// Which columns to read, and what an episode is. `regex:PATTERN` stands for all columns whose name it matches.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
+/// Which columns to read, and what an episode is. `regex:PATTERN` stands for all columns whose name it matches; `file` for
+/// the name of a row's file, unless a file has a column of this name.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct TableOptions {
     /// Columns of x; a vector column counts as many as it is long.
     pub x: Vec<String>,
@@ -44,8 +50,29 @@ pub struct TableOptions {
     pub group: Option<String>,
     /// Order of the rows within an episode; without `group` all rows are one series.
     pub time: Option<String>,
+    /// Columns each of whose values is a word, whatever it looks like.
+    pub words: Vec<String>,
+    /// Which rows to read; all others are as if they were not there.
+    pub filter: Option<Predicate>,
     /// Rows to draw, if not all are to be used.
     pub sample: Option<Sample>,
+    /// Columns of whose every value there is a set of samples of its own.
+    pub by: Vec<String>,
+}
+
+impl TableOptions {
+    /// All columns that are named.
+    fn wanted(&self) -> Vec<&str> {
+        let keys = self.group.iter().chain(&self.by).map(String::as_str);
+        self.values().into_iter().chain(keys).collect()
+    }
+
+    /// The columns whose values mean something: not only that they are equal.
+    fn values(&self) -> Vec<&str> {
+        let filter = self.filter.iter().flat_map(Predicate::columns);
+        let lists = self.x.iter().chain(&self.y).chain(&self.given).chain(&self.time);
+        lists.chain(filter).map(String::as_str).collect()
+    }
 }
 
 /// Whether a path is a rollout store: a directory, an `.mcap` file, or Parquet with the key `ccmarl.manifest`.
@@ -60,147 +87,122 @@ pub fn is_store(path: &Path) -> Result<bool, PairsError> {
         return Ok(true);
     }
     let form = table_form(path)?;
-    Ok(form == TableForm::Parquet && guarded(path, form, || parquet::is_store(path))?)
+    Ok(form == TableForm::Parquet && guarded(path, form, || is_parquet_store(path))?)
 }
 
-/// Samples from the named columns. Rows with a missing value are left out and counted in the notes.
+/// Samples from the named columns of one file. Rows with a missing value are left out and counted in the notes.
 ///
 /// # Errors
 /// [`PairsError`] that names column and row.
 pub fn table(path: &Path, options: &TableOptions) -> Result<Samples, PairsError> {
-    caught(path, |file| {
-        let options = expanded(file, path, options)?;
-        let (frame, note) = frame(file, path, &options)?;
-        let mut set = samples(&frame, path, &options)?;
-        set.notes.extend(note);
-        Ok(set)
+    let mut sets = tables(&[path.to_owned()], &TableOptions { by: Vec::new(), ..options.clone() })?.0;
+    sets.pop().ok_or_else(|| PairsError::NoFiles("no file was named".to_owned()))
+}
+
+/// Samples from the named columns of several files, whose rows follow each other: one set, or one per value of the columns
+/// `options.by`, in order; and what was left out: values without a common row of x and y.
+///
+/// # Errors
+/// As [`table()`]; [`PairsError::Types`] when two files hold different things in a column; [`PairsError::TooManyParts`].
+pub fn tables(paths: &[PathBuf], options: &TableOptions) -> Result<(Vec<Samples>, Vec<String>), PairsError> {
+    whole(paths, || {
+        let (table, options) = filtered(paths, options)?;
+        let chosen = Chosen::of(&table, &options)?;
+        let (mut sets, mut left_out) = (Vec::new(), Vec::new());
+        let mut last = None;
+        for part in rows::parts(&table, &options.by)? {
+            match chosen.samples(&part) {
+                Ok(set) => sets.push(set),
+                Err(error) => {
+                    left_out.push(format!("{}: {error}", part.within.as_deref().unwrap_or("all rows")));
+                    last = Some(error);
+                }
+            }
+        }
+        match last {
+            Some(error) if sets.is_empty() => Err(error),
+            _ => Ok((sets, left_out)),
+        }
     })
 }
 
 /// One set of samples per unordered pair of the columns `options.x`, or of all columns of numbers or words; and what was
-/// left out: empty columns, and pairs without a common row. The file is read once; rows with a missing value are left out
+/// left out: empty columns, and pairs without a common row. The files are read once; rows with a missing value are left out
 /// pair by pair.
 ///
 /// # Errors
-/// As [`table()`]; [`PairsError::NoPairs`]; [`PairsError::NoRows`] when no pair is left.
-pub fn all_pairs(path: &Path, options: &TableOptions) -> Result<(Vec<Samples>, Vec<String>), PairsError> {
-    caught(path, |file| {
-        let mut options = expanded(file, path, options)?;
-        let chosen = !options.x.is_empty();
-        if !chosen {
-            options.x = file.names()?;
+/// As [`tables()`]; [`PairsError::NoPairs`]; [`PairsError::NoRows`] when no pair is left.
+pub fn all_pairs(paths: &[PathBuf], options: &TableOptions) -> Result<(Vec<Samples>, Vec<String>), PairsError> {
+    whole(paths, || {
+        let named = !options.x.is_empty();
+        let mut options = options.clone();
+        let mut left_out = Vec::new();
+        if !named {
+            (options.x, left_out) = names::of_first(paths)?;
         }
-        let (frame, note) = frame(file, path, &options)?;
-        let others: Vec<&String> = options.given.iter().chain(&options.group).chain(&options.time).collect();
+        let (table, options) = filtered(paths, &options)?;
+        let keys = options.group.iter().chain(&options.by);
+        let others: Vec<&String> = options.given.iter().chain(&options.time).chain(keys).collect();
         let usable = |name: &&String| {
-            let kind = frame.column(name).map(|c| c.dtype().clone());
-            let readable = kind.is_ok_and(|kind| is_numeric(&kind) || kind == DataType::String);
-            chosen || (readable && !others.contains(name))
+            let held = table.frame.column(name).map(|column| Holds::of(column.dtype()));
+            named || (held.is_ok_and(|held| held != Holds::Other) && !others.contains(name))
         };
         let columns: Vec<String> = options.x.iter().filter(usable).cloned().collect();
         if columns.len() < 2 {
-            return Err(PairsError::NoPairs { found: columns.len(), path: path.to_owned() });
+            return Err(PairsError::NoPairs { found: columns.len(), path: table.path() });
         }
-        let is_empty = |name: &String| frame.column(name).is_ok_and(|c| c.null_count() == frame.height());
+        let parts = rows::parts(&table, &options.by)?;
+        let rows = table.frame.height();
+        let is_empty = |name: &String| table.frame.column(name).is_ok_and(|c| c.null_count() == rows);
         let (empty, full): (Vec<String>, Vec<String>) = columns.into_iter().partition(is_empty);
         let (mut sets, mut last) = (Vec::new(), None);
-        let mut left_out: Vec<String> = empty.iter().map(|name| format!("column {name:?} is empty")).collect();
+        left_out.extend(empty.iter().map(|name| format!("column {name:?} is empty")));
         for (i, j) in (0..full.len()).flat_map(|i| (i + 1..full.len()).map(move |j| (i, j))) {
             let (x, y) = (vec![full[i].clone()], vec![full[j].clone()]);
-            match samples(&frame, path, &TableOptions { x, y, ..options.clone() }) {
-                Ok(mut set) => {
-                    set.notes.extend(note.clone());
-                    sets.push(set);
+            let options = TableOptions { x, y, ..options.clone() };
+            let chosen = Chosen::of(&table, &options)?;
+            for part in &parts {
+                match chosen.samples(part) {
+                    Ok(set) => sets.push(set),
+                    Err(error) => {
+                        let within = part.within.as_ref().map(|within| format!("{within}: ")).unwrap_or_default();
+                        left_out.push(format!("{within}{error}"));
+                        last = Some(error);
+                    }
                 }
-                Err(error @ PairsError::NoRows { .. }) => {
-                    left_out.push(error.to_string());
-                    last = Some(error);
-                }
-                Err(error) => return Err(error),
             }
         }
         if !sets.is_empty() {
             return Ok((sets, left_out));
         }
         let columns = full.into_iter().chain(empty).collect::<Vec<_>>().join(", ");
-        Err(last.unwrap_or_else(|| PairsError::NoRows { rows: frame.height(), columns, path: path.to_owned() }))
+        Err(last.unwrap_or_else(|| PairsError::NoRows { rows, columns, path: table.path() }))
     })
 }
 
-/// The columns that the options name, of all rows or of those that are drawn, and what was not.
-fn frame(file: &dyn TableFile, path: &Path, options: &TableOptions) -> Result<(DataFrame, Option<String>), PairsError> {
-    let columns = wanted(options);
-    let Some(sample) = &options.sample else { return Ok((form::wanted(file, path, &columns)?, None)) };
-    let mut drawn = Drawn::new(sample);
-    let mut add = |piece: &dyn TableFile| -> Result<(), PairsError> {
-        drawn.add(&form::wanted(piece, path, &columns)?).map_err(form::unreadable("table", path))
-    };
-    match file.pieces(PieceSize::default())? {
-        Some(pieces) => pieces.into_iter().try_for_each(|piece| add(&*piece?))?,
-        None => add(file)?,
+/// The table without the rows that the filter leaves out; the options with their patterns replaced.
+fn filtered(paths: &[PathBuf], options: &TableOptions) -> Result<(Table, TableOptions), PairsError> {
+    if let Some(sample) = &options.sample {
+        return pass::drawn(paths, options, sample);
     }
-    let (frame, all) = drawn.finish().map_err(form::unreadable("table", path))?;
-    let note = sampled_note(frame.height(), all);
-    Ok((frame, note))
-}
-
-/// What is said of values on a sample.
-fn sampled_note(rows: usize, all: u64) -> Option<String> {
-    (all > rows as u64).then(|| format!("{NOTE}estimated on {rows} of {all} rows, drawn at random"))
-}
-
-/// All columns that the options name.
-fn wanted(options: &TableOptions) -> Vec<&str> {
-    let keys = options.group.iter().chain(&options.time);
-    options.x.iter().chain(&options.y).chain(&options.given).chain(keys).map(String::as_str).collect()
-}
-
-fn samples(frame: &DataFrame, path: &Path, options: &TableOptions) -> Result<Samples, PairsError> {
-    let [x, y, z] = [&options.x, &options.y, &options.given].map(|names| numbers(frame, names, path));
-    let (x, y, z) = (x?, y?, z?);
-    let height = frame.height();
-    let group = options.group.as_deref().map(|name| texts(frame, name, path)).transpose()?;
-    let time = options.time.as_deref().map(|name| Order::of(frame, name, path)).transpose()?;
-    let whole = |r: usize| {
-        let values = || x.row(r).iter().chain(y.row(r)).chain(z.row(r));
-        values().all(|v| !v.is_nan())
-            && group.as_ref().is_none_or(|g| g[r].is_some())
-            && time.as_ref().is_none_or(|t| t.has(r))
-    };
-    let mut rows: Vec<usize> = (0..height).filter(|&r| whole(r)).collect();
-    let columns = wanted(options).join(", ");
-    if rows.is_empty() {
-        return Err(PairsError::NoRows { rows: height, columns, path: path.to_owned() });
-    }
-    if height > u32::MAX as usize {
+    let (mut table, options) = Table::read(paths, options)?;
+    if table.frame.height() > u32::MAX as usize {
         return Err(PairsError::TooManyRows);
     }
-    let mut notes = Vec::new();
-    if rows.len() < height {
-        notes.push(format!("{} of {height} rows left out: a missing value in {columns}", height - rows.len()));
+    if table.frame.height() == 0 {
+        return Err(PairsError::EmptyTable(table.path()));
     }
-    if let Some(time) = &time {
-        rows.sort_by(|&a, &b| time.compare(a, b));
+    if let Some(predicate) = &options.filter {
+        rows::keep(&mut table, predicate)?;
     }
-    let (starts, label) = episodes(&mut rows, group.as_deref(), options);
-    let pick = |columns: &Columns| {
-        let data = rows.iter().flat_map(|&r| columns.row(r).iter().copied()).collect();
-        Arc::new(Columns { data, names: columns.names.clone(), words: columns.words.clone() })
-    };
-    Ok(Samples {
-        x: pick(&x),
-        y: pick(&y),
-        z: (!options.given.is_empty()).then(|| pick(&z)),
-        starts: starts.into(),
-        rows: (0..rows.len() as u32).collect(),
-        exchange: if group.is_none() && time.is_some() { Exchange::Shift } else { Exchange::Episodes },
-        labels: SampleLabels {
-            x: options.x.join(","),
-            y: options.y.join(","),
-            given: (!options.given.is_empty()).then(|| options.given.join(",")),
-            group: label,
-            ..SampleLabels::default()
-        },
-        notes,
+    Ok((table, options))
+}
+
+/// Runs what reads whole files; a panic in there becomes an error of ours.
+fn whole<T>(paths: &[PathBuf], read: impl FnOnce() -> Result<T, PairsError>) -> Result<T, PairsError> {
+    let path = paths.first().ok_or_else(|| PairsError::NoFiles("no file was named".to_owned()))?;
+    crate::io::caught(read).unwrap_or_else(|| {
+        let message = "its columns cannot be used: the file is damaged".to_owned();
+        Err(PairsError::Unreadable { form: "data", message, path: path.clone() })
     })
 }

@@ -1,9 +1,9 @@
 //! Columns by pattern.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::TableOptions;
-use super::form::TableFile;
+use super::form::{TableFile, caught};
 use crate::pairs::PairsError;
 
 /// What a name begins with that is a pattern.
@@ -38,4 +38,16 @@ pub(super) fn expanded(file: &dyn TableFile, path: &Path, options: &TableOptions
         *list = found;
     }
     Ok(out)
+}
+
+/// All columns of the first file that can be read; and what is said of the others.
+pub(super) fn of_first(paths: &[PathBuf]) -> Result<(Vec<String>, Vec<String>), PairsError> {
+    let path = paths.first().ok_or_else(|| PairsError::NoFiles("no file was named".to_owned()))?;
+    caught(path, |file| {
+        let unusable = file.unusable()?;
+        let mut names = file.names()?;
+        names.retain(|name| !unusable.iter().any(|(other, _)| other == name));
+        let said = unusable.into_iter().map(|(name, kind)| format!("column {name:?} holds {kind}"));
+        Ok((names, said.collect()))
+    })
 }

@@ -1,11 +1,12 @@
 //! Which rows are one episode, and in which order they stand.
 
-use std::path::Path;
+use std::cmp::Ordering;
 
-use polars::prelude::{DataFrame, DataType};
+use polars::prelude::DataType;
 
 use super::TableOptions;
-use super::numbers::{column, flat, not_numeric};
+use super::numbers::{Holds, not_numeric};
+use super::several::Table;
 use crate::pairs::PairsError;
 
 /// Blocks into which one series is cut.
@@ -39,40 +40,57 @@ pub(super) fn episodes(
 }
 
 /// A column as text, for grouping.
-pub(super) fn texts(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<Option<String>>, PairsError> {
-    let column = column(frame, name, path)?;
-    let cast = column.cast(&DataType::String).ok().ok_or_else(|| not_numeric(frame, column, path))?;
-    let values = cast.str().ok().ok_or_else(|| not_numeric(frame, column, path))?;
+pub(super) fn texts(table: &Table, name: &str) -> Result<Vec<Option<String>>, PairsError> {
+    let column = table.column(name)?;
+    let cast = column.cast(&DataType::String).ok().ok_or_else(|| not_numeric(table, column))?;
+    let values = cast.str().ok().ok_or_else(|| not_numeric(table, column))?;
     Ok(values.iter().map(|v| v.map(str::to_owned)).collect())
 }
 
-/// A column that orders rows: numbers by size, text by its bytes (ISO dates sort rightly).
+/// A column that orders rows. Integers and dates are compared as such: nanoseconds since 1970 do not fit a float.
 pub(super) enum Order {
-    Numbers(Vec<f64>),
-    Texts(Vec<Option<String>>),
+    Integers(Vec<Option<i64>>),
+    Floats(Vec<f64>),
 }
 
 impl Order {
-    pub(super) fn of(frame: &DataFrame, name: &str, path: &Path) -> Result<Self, PairsError> {
-        let column = column(frame, name, path)?;
-        if column.dtype() == &DataType::String {
-            return texts(frame, name, path).map(Self::Texts);
+    pub(super) fn of(table: &Table, name: &str) -> Result<Self, PairsError> {
+        let column = table.column(name)?;
+        let held = Holds::of(column.dtype());
+        if held == Holds::Words {
+            return Err(PairsError::NoTime { name: name.to_owned(), path: table.path() });
         }
-        let (width, values) = flat(frame, column, path)?;
-        if width == 1 { Ok(Self::Numbers(values)) } else { Err(not_numeric(frame, column, path)) }
+        let unfit = || not_numeric(table, column);
+        if held == Holds::Other {
+            return Err(unfit());
+        }
+        let ticks = column.to_physical_repr();
+        let integers = ticks.cast(&DataType::Int64).ok().ok_or_else(unfit)?;
+        if !ticks.dtype().is_float() && integers.null_count() == ticks.null_count() {
+            return Ok(Self::Integers(integers.i64().ok().ok_or_else(unfit)?.iter().collect()));
+        }
+        let floats = ticks.cast(&DataType::Float64).ok().ok_or_else(unfit)?;
+        Ok(Self::Floats(floats.f64().ok().ok_or_else(unfit)?.iter().map(|v| v.unwrap_or(f64::NAN)).collect()))
     }
 
     pub(super) fn has(&self, row: usize) -> bool {
         match self {
-            Self::Numbers(values) => !values[row].is_nan(),
-            Self::Texts(values) => values[row].is_some(),
+            Self::Integers(values) => values[row].is_some(),
+            Self::Floats(values) => !values[row].is_nan(),
         }
     }
 
-    pub(super) fn compare(&self, a: usize, b: usize) -> std::cmp::Ordering {
+    pub(super) fn compare(&self, a: usize, b: usize) -> Ordering {
         match self {
-            Self::Numbers(values) => values[a].total_cmp(&values[b]),
-            Self::Texts(values) => values[a].cmp(&values[b]),
+            Self::Integers(values) => values[a].cmp(&values[b]),
+            // −0 and 0 are one time
+            Self::Floats(values) => values[a].partial_cmp(&values[b]).unwrap_or(Ordering::Equal),
         }
+    }
+
+    /// How many of the ordered rows stand at the same time as the row before them in their episode.
+    pub(super) fn ties(&self, rows: &[usize], starts: &[usize], one_series: bool) -> usize {
+        let same = |at: usize| self.compare(rows[at - 1], rows[at]) == Ordering::Equal;
+        (1..rows.len()).filter(|&at| (one_series || starts.binary_search(&at).is_err()) && same(at)).count()
     }
 }

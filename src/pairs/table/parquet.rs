@@ -5,8 +5,9 @@ use std::path::{Path, PathBuf};
 use polars::io::parquet::metadata::FileMetadataRef;
 use polars::prelude::{DataFrame, ParquetReader, SerReader as _};
 
-use super::form::{PieceSize, Pieces, TableFile, open, unreadable};
+use super::form::{PieceSize, Pieces, TableFile, open, unreadable, unusable};
 use crate::pairs::PairsError;
+use crate::storage::TableForm;
 
 const FORM: &str = "Parquet";
 
@@ -15,7 +16,7 @@ pub(super) struct Parquet(PathBuf);
 
 impl Parquet {
     pub(super) fn new(path: &Path) -> Result<Self, PairsError> {
-        crate::storage::check_table(path)?;
+        crate::storage::check_table(path, TableForm::Parquet)?;
         Ok(Self(path.to_owned()))
     }
 }
@@ -24,6 +25,11 @@ impl TableFile for Parquet {
     fn names(&self) -> Result<Vec<String>, PairsError> {
         let schema = ParquetReader::new(open(&self.0)?).schema().map_err(unreadable(FORM, &self.0))?;
         Ok(schema.iter_names().map(ToString::to_string).collect())
+    }
+
+    fn unusable(&self) -> Result<Vec<(String, String)>, PairsError> {
+        let schema = ParquetReader::new(open(&self.0)?).schema().map_err(unreadable(FORM, &self.0))?;
+        Ok(unusable(schema.iter_values()))
     }
 
     fn read(&self, columns: &[&str]) -> Result<DataFrame, PairsError> {

@@ -1,8 +1,13 @@
 //! Some rows of a table, drawn while it is read piece by piece.
 
-use polars::prelude::{BooleanChunked, DataFrame, NewChunkedArray as _, PolarsResult};
+use std::path::{Path, PathBuf};
+
+use polars::prelude::{BooleanChunked, DataFrame, NewChunkedArray as _};
 use rand::Rng as _;
 
+use super::form::unreadable;
+use super::several::Table;
+use crate::pairs::PairsError;
 use crate::rng::{Seeds, Stream};
 
 /// How many rows are drawn, and from which seed.
@@ -19,55 +24,63 @@ pub struct Sample {
 pub(super) struct Drawn {
     wanted: usize,
     stream: Stream,
-    /// Rows seen.
-    pub(super) seen: u64,
-    kept: Option<DataFrame>,
-    keys: Vec<u64>,
-    /// Keys from here on are not among the smallest.
+    kept: Option<Table>,
+    /// Of each row that is kept, its number and its place among all.
+    keys: Vec<(u64, usize)>,
+    /// Numbers from here on are not among the smallest.
     limit: u64,
 }
 
 impl Drawn {
     pub(super) fn new(sample: &Sample) -> Self {
         let stream = sample.seeds.stream("rows");
-        Self { wanted: sample.rows, stream, seen: 0, kept: None, keys: Vec::new(), limit: u64::MAX }
+        Self { wanted: sample.rows, stream, kept: None, keys: Vec::new(), limit: u64::MAX }
     }
 
-    pub(super) fn add(&mut self, piece: &DataFrame) -> PolarsResult<()> {
-        let keys: Vec<u64> = (0..piece.height()).map(|_| self.stream.next_u64()).collect();
-        self.seen += keys.len() as u64;
-        let mask: Vec<bool> = keys.iter().map(|&key| key < self.limit).collect();
-        let chosen = piece.filter(&BooleanChunked::from_slice("".into(), &mask))?;
-        self.keys.extend(keys.into_iter().filter(|&key| key < self.limit));
+    /// Offers rows, whose places among all are `places`.
+    pub(super) fn add(&mut self, rows: &DataFrame, places: &[usize], path: &Path) -> Result<(), PairsError> {
+        let keys: Vec<(u64, usize)> = places.iter().map(|&place| (self.stream.next_u64(), place)).collect();
+        let mask: Vec<bool> = keys.iter().map(|key| key.0 < self.limit).collect();
+        let chosen = filtered(rows, &mask, path)?;
+        self.keys.extend(keys.into_iter().filter(|key| key.0 < self.limit));
         match &mut self.kept {
-            Some(kept) => {
-                kept.vstack_mut(&chosen)?;
-            }
-            None => self.kept = Some(chosen),
+            Some(kept) => kept.append(chosen, path)?,
+            None => self.kept = Some(Table::of(chosen, path)),
         }
         if self.keys.len() > 2 * self.wanted + (1 << 16) { self.prune() } else { Ok(()) }
     }
 
     /// Leaves only the wanted number of rows.
-    fn prune(&mut self) -> PolarsResult<()> {
+    fn prune(&mut self) -> Result<(), PairsError> {
         if self.keys.len() <= self.wanted {
             return Ok(());
         }
-        self.limit = *self.keys.clone().select_nth_unstable(self.wanted).1;
-        let limit = self.limit;
-        let mask: Vec<bool> = self.keys.iter().map(|&key| key < limit).collect();
+        let mut numbers: Vec<u64> = self.keys.iter().map(|key| key.0).collect();
+        let limit = *numbers.select_nth_unstable(self.wanted).1;
+        self.limit = limit;
+        let mask: Vec<bool> = self.keys.iter().map(|key| key.0 < limit).collect();
         if let Some(kept) = &mut self.kept {
-            *kept = kept.filter(&BooleanChunked::from_slice("".into(), &mask))?;
+            kept.frame = filtered(&kept.frame, &mask, &kept.path())?;
         }
-        self.keys.retain(|&key| key < limit);
+        self.keys.retain(|key| key.0 < limit);
         Ok(())
     }
 
-    /// The rows, in the order of the table, and how many there were to choose from.
-    pub(super) fn finish(mut self) -> PolarsResult<(DataFrame, u64)> {
+    /// The rows in the order of the table, whose files are `files`, with the row behind the last one of each; `None` when
+    /// there was none to draw from.
+    pub(super) fn finish(
+        mut self,
+        files: Vec<(PathBuf, usize)>,
+        notes: Vec<String>,
+    ) -> Result<Option<Table>, PairsError> {
         self.prune()?;
-        Ok((self.kept.unwrap_or_default(), self.seen))
+        let places = self.keys.into_iter().map(|key| key.1).collect();
+        Ok(self.kept.map(|kept| kept.drawn(files, places, notes)))
     }
+}
+
+fn filtered(rows: &DataFrame, mask: &[bool], path: &Path) -> Result<DataFrame, PairsError> {
+    rows.filter(&BooleanChunked::from_slice("".into(), mask)).map_err(unreadable("table", path))
 }
 
 #[cfg(test)]
@@ -83,11 +96,13 @@ mod tests {
             let values: Vec<u32> = (from..from + cut as u32).collect();
             from += cut as u32;
             let column = Column::from(Series::new("a".into(), values));
-            drawn.add(&DataFrame::new(cut, vec![column]).unwrap()).unwrap();
+            let places: Vec<usize> = (from as usize - cut..from as usize).collect();
+            drawn.add(&DataFrame::new(cut, vec![column]).unwrap(), &places, Path::new("t")).unwrap();
         }
-        let (frame, seen) = drawn.finish().unwrap();
-        assert_eq!(seen, u64::from(from));
-        frame.column("a").unwrap().u32().unwrap().iter().flatten().collect()
+        let table = drawn.finish(vec![(PathBuf::from("t"), from as usize)], Vec::new()).unwrap().unwrap();
+        let first = table.frame.column("a").unwrap().u32().unwrap().get(0).unwrap();
+        assert_eq!(table.place(0), (first as usize + 1, PathBuf::from("t")));
+        table.frame.column("a").unwrap().u32().unwrap().iter().flatten().collect()
     }
 
     #[test]

@@ -1,6 +1,6 @@
-//! CSV and TSV.
+//! CSV and TSV. The first line names the columns.
 
-use std::io::Cursor;
+use std::io::{BufReader, Cursor, Read as _};
 use std::path::{Path, PathBuf};
 
 use polars::io::mmap::MmapBytesReader;
@@ -12,7 +12,10 @@ use crate::io::IoError;
 use crate::pairs::PairsError;
 use crate::storage::TableForm;
 
-/// Lines of text, the first of which names the columns.
+/// Longest line, bytes.
+const LINE_LIMIT: usize = 16 << 20;
+
+/// Lines of text, none of which is absurdly long.
 pub(super) struct Text {
     path: PathBuf,
     form: TableForm,
@@ -20,8 +23,9 @@ pub(super) struct Text {
 }
 
 impl Text {
-    pub(super) fn new(path: &Path, form: TableForm, separator: u8) -> Self {
-        Self { path: path.to_owned(), form, separator }
+    pub(super) fn new(path: &Path, form: TableForm, separator: u8) -> Result<Self, PairsError> {
+        check_lines(path, form)?;
+        Ok(Self { path: path.to_owned(), form, separator })
     }
 
     fn finish(&self, options: CsvReadOptions) -> Result<DataFrame, PairsError> {
@@ -29,16 +33,44 @@ impl Text {
     }
 
     fn parsed(&self, text: impl MmapBytesReader, options: CsvReadOptions) -> Result<DataFrame, PairsError> {
+        let options = options.with_infer_schema_length(Some(0));
         let options = options.map_parse_options(|options| options.with_separator(self.separator));
         let frame = options.into_reader_with_file_handle(text).finish();
-        frame.map_err(unreadable(self.form.name(), &self.path))
+        frame.map_err(|error| match self.uneven() {
+            Some((row, found, expected)) => {
+                let message = format!("row {row} has {found} fields, expected {expected} as in the first line");
+                PairsError::Unreadable { form: self.form.name(), message, path: self.path.clone() }
+            }
+            None => unreadable(self.form.name(), &self.path)(error),
+        })
+    }
+
+    /// The first row of data with more fields than the first line, how many those are, and how many it may have; asked
+    /// only when the reader gave up, since it does not say where.
+    fn uneven(&self) -> Option<(usize, usize, usize)> {
+        let input = BufReader::with_capacity(1 << 18, open(&self.path).ok()?);
+        let (mut row, mut fields, mut expected, mut quoted) = (0, 1, 0, false);
+        for byte in input.bytes() {
+            match byte.ok()? {
+                b'"' => quoted = !quoted,
+                b'\n' if !quoted => {
+                    if row > 0 && fields > expected {
+                        return Some((row, fields, expected));
+                    }
+                    expected = if row == 0 { fields } else { expected };
+                    (row, fields) = (row + 1, 1);
+                }
+                byte if byte == self.separator && !quoted => fields += 1,
+                _ => {}
+            }
+        }
+        (row > 0 && fields > expected).then_some((row, fields, expected))
     }
 }
 
 impl TableFile for Text {
     fn names(&self) -> Result<Vec<String>, PairsError> {
-        let frame = self.finish(CsvReadOptions::default().with_n_rows(Some(0)).with_infer_schema_length(Some(0)))?;
-        Ok(frame.get_column_names().into_iter().map(ToString::to_string).collect())
+        Ok(names(&self.finish(CsvReadOptions::default().with_n_rows(Some(0)))?))
     }
 
     fn read(&self, columns: &[&str]) -> Result<DataFrame, PairsError> {
@@ -57,10 +89,12 @@ impl TableFile for Text {
     }
 }
 
-/// The whole text decides a column's type: a float in the last row must not be an error.
 fn of_columns(columns: &[&str]) -> CsvReadOptions {
-    let columns = columns.iter().map(|&c| c.into()).collect();
-    CsvReadOptions::default().with_infer_schema_length(None).with_columns(Some(columns))
+    CsvReadOptions::default().with_columns(Some(columns.iter().map(|&c| c.into()).collect()))
+}
+
+fn names(frame: &DataFrame) -> Vec<String> {
+    frame.get_column_names().into_iter().map(ToString::to_string).collect()
 }
 
 /// Some lines of such a file, under its first line.
@@ -71,12 +105,41 @@ struct Piece<'a> {
 
 impl TableFile for Piece<'_> {
     fn names(&self) -> Result<Vec<String>, PairsError> {
-        let options = CsvReadOptions::default().with_n_rows(Some(0)).with_infer_schema_length(Some(0));
-        let frame = self.of.parsed(Cursor::new(&self.text), options)?;
-        Ok(frame.get_column_names().into_iter().map(ToString::to_string).collect())
+        Ok(names(&self.of.parsed(Cursor::new(&self.text), CsvReadOptions::default().with_n_rows(Some(0)))?))
     }
 
     fn read(&self, columns: &[&str]) -> Result<DataFrame, PairsError> {
         self.of.parsed(Cursor::new(&self.text), of_columns(columns))
+    }
+}
+
+/// How zip archives (spreadsheets, .npz) and gzip files begin.
+const PACKED: [&[u8]; 2] = [b"PK\x03\x04", b"\x1f\x8b"];
+
+/// Refuses what is packed, and a line that is longer than [`LINE_LIMIT`]: no table has one, and the reader would hold it
+/// in memory.
+fn check_lines(path: &Path, form: TableForm) -> Result<(), PairsError> {
+    let (mut file, mut block) = (open(path)?, vec![0; 1 << 18]);
+    let (mut line, mut length) = (1_u64, 0);
+    loop {
+        let read = file.read(&mut block).map_err(IoError::os("read", path))?;
+        if line == 1 && PACKED.iter().any(|magic| block[..read].starts_with(magic)) {
+            let message = "it is packed (zip, gzip, .npz, a spreadsheet): unpack it, or save it as a table".to_owned();
+            return Err(PairsError::Unreadable { form: form.name(), message, path: path.to_owned() });
+        }
+        let mut pieces = block[..read].split(|&byte| byte == b'\n');
+        length += pieces.next().map_or(0, <[u8]>::len);
+        for piece in pieces {
+            if length > LINE_LIMIT {
+                break;
+            }
+            (line, length) = (line + 1, piece.len());
+        }
+        if length > LINE_LIMIT {
+            return Err(PairsError::LongLine { line, limit: LINE_LIMIT, path: path.to_owned() });
+        }
+        if read == 0 {
+            return Ok(());
+        }
     }
 }
