@@ -353,7 +353,7 @@ fn cells_are_read_honestly_or_not_at_all() {
             &[&all, "--x", "a", "--y", "b", "--where", "a > 'x'"],
             "column \"a\" (a number) cannot be compared with 'x' (text)",
         ),
-        (2, &[&all, "--x", "a", "--y", "b", "--where", "ab > 3"], "no column \"ab\": did you mean a, b?: "),
+        (2, &[&all, "--x", "a", "--y", "b", "--where", "ab > 3"], "no column \"ab\": did you mean a?: "),
         (
             1,
             &[&all, "--x", "a", "--y", "b", "--where", "a > 99"],
@@ -534,9 +534,15 @@ fn the_messages_of_a_store_are_columns_too() {
     let bytes = std::fs::read(form("json.mcap")).unwrap();
     let path = dir.path().join("a.mcap");
     let wanted = options(&["/imu.v[0]"], &["/state.level"]);
+    let whole = read(&[form("json.mcap")], &wanted).unwrap();
+    save(&path, &bytes[..bytes.len() / 2]);
+    assert!(read(std::slice::from_ref(&path), &wanted).unwrap_err().starts_with("damaged: cut short"));
     for at in (0..bytes.len()).step_by(11) {
         save(&path, &bytes[..at]);
-        assert!(read(std::slice::from_ref(&path), &wanted).is_err(), "cut to {at} bytes");
+        // what stands behind the data repeats it
+        if let Ok(found) = read(std::slice::from_ref(&path), &wanted) {
+            assert_eq!(found, whole, "cut to {at} bytes");
+        }
         let mut changed = bytes.clone();
         changed[at] ^= 0x41;
         save(&path, &changed);
