@@ -1,7 +1,7 @@
 //! Messages that encoders make: what a run with them records, keeps, resumes, starts from, and refuses.
 
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
 use ccmarl::algo::{ActorStep, Actors, Masks, Messages};
 use ccmarl::nn::Tape;
@@ -10,7 +10,7 @@ use ccmarl::schema::Episode;
 use ccmarl::train::config::{Estimators, LostMessage, PairSource, Shaping};
 use ccmarl::train::{METRIC_COLUMNS, Options, TrainConfig, Trainer, train};
 
-use super::train::{LEARNED, bytes, config, run};
+use super::train::{Set, bytes, config, each_resumes_and_differs, run};
 
 fn encoded(algorithm: &str, steps: u64) -> TrainConfig {
     let mut config = config(algorithm, steps);
@@ -32,7 +32,6 @@ fn ccmarl(words: &[&str]) -> (Option<i32>, String, String) {
 
 #[test]
 fn every_way_to_train_an_encoder_differs_and_resumes_to_the_same_bytes() {
-    type Set = fn(&mut TrainConfig);
     let options: [(&str, Set); 10] = [
         ("defaults", |_| ()),
         ("other width", |c| c.maddpg.message_width = Some(2)),
@@ -45,24 +44,7 @@ fn every_way_to_train_an_encoder_differs_and_resumes_to_the_same_bytes() {
         ("shaping at rollout", |c| c.dumie.shaping = Shaping::AtRollout),
         ("nothing arrives", |c| c.prior = Some(Spec::new("none"))),
     ];
-    let dir = tempfile::tempdir().unwrap();
-    let mut seen = Vec::new();
-    for (name, set) in options {
-        let mut wanted = encoded("cc-maddpg", 3000);
-        set(&mut wanted);
-        let [whole, parts] = ["whole", "parts"].map(|part| dir.path().join(name).join(part));
-        run(wanted.clone(), &whole, &Options::default());
-        let stop = AtomicBool::new(false);
-        let mut progress = |p: ccmarl::train::Progress| stop.store(p.step >= 2000, Ordering::Relaxed);
-        train(wanted.clone(), &parts, &Options::default(), &mut progress, &stop).unwrap();
-        run(wanted, &parts, &Options { resume: true, ..Options::default() });
-        for file in LEARNED.into_iter().chain(["checkpoint/state.safetensors", "config.toml"]) {
-            assert!(bytes(&whole, file) == bytes(&parts, file), "{name}: {file} differs after a stop");
-        }
-        let actors = bytes(&whole, LEARNED[0]);
-        assert!(!seen.contains(&actors), "{name} changed nothing");
-        seen.push(actors);
-    }
+    each_resumes_and_differs(&encoded("cc-maddpg", 3000), &options);
 }
 
 #[test]

@@ -92,29 +92,15 @@ fn an_interrupted_run_that_is_resumed_ends_with_the_bytes_of_an_uninterrupted_on
     }
 }
 
-#[test]
-fn every_option_of_learner_and_estimators_trains_differently_and_resumes_to_the_same_bytes() {
-    use ccmarl::algo::{ActorStep, Masks, Messages};
-    use ccmarl::train::config::{Estimators, LostMessage, Negatives, PairSource, Shaping};
+/// A change of a configuration.
+pub(crate) type Set = fn(&mut TrainConfig);
 
-    type Set = fn(&mut TrainConfig);
-    let options: [(&str, Set); 11] = [
-        ("defaults", |_| ()),
-        ("messages off", |c| c.maddpg.messages = Messages::Off),
-        ("actor step per agent", |c| c.maddpg.actor_step = ActorStep::PerAgent),
-        ("masks redrawn", |c| c.maddpg.masks = Masks::Redrawn),
-        ("all negatives", |c| c.dumie.negatives = Negatives::All),
-        ("an estimator per link", |c| (c.dumie.estimators, c.dumie.start) = (Estimators::PerLink, 60)),
-        ("pairs from replay", |c| c.dumie.pairs = PairSource::Replay),
-        ("lost messages as zeros", |c| c.dumie.lost_message = LostMessage::Zero),
-        ("shaping at rollout", |c| c.dumie.shaping = Shaping::AtRollout),
-        ("unshifted", |c| c.dumie.jsd_shift = false),
-        ("two estimator steps", |c| c.dumie.k = 2),
-    ];
+/// Trains `base` with each change, whole and stopped in between: the same bytes, and other actors than with any other.
+pub(crate) fn each_resumes_and_differs(base: &TrainConfig, options: &[(&str, Set)]) {
     let dir = tempfile::tempdir().unwrap();
     let mut seen = Vec::new();
     for (name, set) in options {
-        let mut wanted = config("cc-maddpg", 3000);
+        let mut wanted = base.clone();
         set(&mut wanted);
         let [whole, parts] = ["whole", "parts"].map(|part| dir.path().join(name).join(part));
         run(wanted.clone(), &whole, &Options::default());
@@ -129,6 +115,27 @@ fn every_option_of_learner_and_estimators_trains_differently_and_resumes_to_the_
         assert!(!seen.contains(&actors), "{name} changed nothing");
         seen.push(actors);
     }
+}
+
+#[test]
+fn every_option_of_learner_and_estimators_trains_differently_and_resumes_to_the_same_bytes() {
+    use ccmarl::algo::{ActorStep, Masks, Messages};
+    use ccmarl::train::config::{Estimators, LostMessage, Negatives, PairSource, Shaping};
+
+    let options: [(&str, Set); 11] = [
+        ("defaults", |_| ()),
+        ("messages off", |c| c.maddpg.messages = Messages::Off),
+        ("actor step per agent", |c| c.maddpg.actor_step = ActorStep::PerAgent),
+        ("masks redrawn", |c| c.maddpg.masks = Masks::Redrawn),
+        ("all negatives", |c| c.dumie.negatives = Negatives::All),
+        ("an estimator per link", |c| (c.dumie.estimators, c.dumie.start) = (Estimators::PerLink, 60)),
+        ("pairs from replay", |c| c.dumie.pairs = PairSource::Replay),
+        ("lost messages as zeros", |c| c.dumie.lost_message = LostMessage::Zero),
+        ("shaping at rollout", |c| c.dumie.shaping = Shaping::AtRollout),
+        ("unshifted", |c| c.dumie.jsd_shift = false),
+        ("two estimator steps", |c| c.dumie.k = 2),
+    ];
+    each_resumes_and_differs(&config("cc-maddpg", 3000), &options);
 }
 
 #[test]
