@@ -87,7 +87,7 @@ mod tests {
 
     #[test]
     fn a_line_about_jobs_says_how_many_and_how_long_still() {
-        assert_eq!(line("estimating", 3, 12, Duration::from_secs(60)), "estimating: 3 of 12, ETA 3 minutes");
-        assert_eq!(line("estimating", 0, 12, Duration::from_secs(60)), "estimating: 0 of 12, ETA unknown");
+        assert_eq!(line("estimating", 3, 12, Duration::from_mins(1)), "estimating: 3 of 12, ETA 3 minutes");
+        assert_eq!(line("estimating", 0, 12, Duration::from_mins(1)), "estimating: 0 of 12, ETA unknown");
     }
 }

@@ -35,12 +35,11 @@ struct Pass {
 pub(super) fn read(paths: &[PathBuf], mut options: TableOptions, plan: Plan, picture: bool) -> Result<Input, Error> {
     let (mut passes, mut rest, mut places) = (Vec::new(), Vec::new(), Vec::new());
     for (place, named) in plan.estimators.into_iter().enumerate() {
-        match named.1.one_pass() {
-            Some(made) => passes.push(Pass { place, named, made: Ok(made) }),
-            None => {
-                rest.push(named);
-                places.push(place);
-            }
+        if let Some(made) = named.1.one_pass() {
+            passes.push(Pass { place, named, made: Ok(made) });
+        } else {
+            rest.push(named);
+            places.push(place);
         }
     }
     if rest.is_empty() && !picture {

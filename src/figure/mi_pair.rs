@@ -134,11 +134,11 @@ fn titled<DB: DrawingBackend>(area: &Area<DB>, name: &str) -> Drawn<DB, Area<DB>
 }
 
 /// A panel's chart, with room for the ticks and names of its axes.
-fn chart<'a, DB: DrawingBackend>(
-    area: &'a Area<DB>,
+fn chart<DB: DrawingBackend>(
+    area: &Area<DB>,
     x: std::ops::Range<f64>,
     y: std::ops::Range<f64>,
-) -> Drawn<DB, Chart<'a, DB>> {
+) -> Drawn<DB, Chart<'_, DB>> {
     ChartBuilder::on(area)
         .margin_left(26)
         .margin_right(40)
@@ -257,16 +257,16 @@ fn training<DB: DrawingBackend>(area: &Area<DB>, training: &Training) -> Drawn<D
     mesh(&mut chart, "training step; dashed: the one used", &training.score)?;
     let chosen = [(training.chosen, style::axis(low, high).start), (training.chosen, style::axis(low, high).end)];
     chart.draw_series(DashedLineSeries::new(chosen, 14, 10, style::SOFT.stroke_width(3)))?;
-    let parts: [(&str, fn(&(f64, f64, f64)) -> f64); 2] = [("training", |l| l.1), ("validation", |l| l.2)];
-    for (at, (_, of)) in parts.iter().enumerate() {
-        let line = training.looks.iter().map(|l| (l.0, of(l)));
+    let parts = ["training", "validation"];
+    for at in 0..parts.len() {
+        let line = training.looks.iter().map(|l| (l.0, [l.1, l.2][at]));
         chart.draw_series(LineSeries::new(line, style::color(at).stroke_width(5)))?;
     }
     // the legend stands in the panel's title line, right of the name: never over data
     let (width, _) = area.dim_in_pixel();
     let style = style::text(style::TICK, style::INK, HPos::Right, VPos::Top);
     let mut x = width as i32 - 40;
-    for (at, (name, _)) in parts.iter().enumerate().rev() {
+    for (at, name) in parts.iter().enumerate().rev() {
         let long = area.estimate_text_size(name, &style)?.0 as i32;
         area.draw_text(name, &style, (x, 26))?;
         area.draw(&Rectangle::new([(x - long - 42, 28), (x - long - 12, 48)], style::color(at).filled()))?;

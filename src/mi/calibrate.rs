@@ -33,7 +33,7 @@ impl Source for Task {
     }
 
     fn samples(&self, n: usize, rng: &mut Stream) -> Samples {
-        Task::samples(self, n, rng)
+        Self::samples(self, n, rng)
     }
 }
 

@@ -213,10 +213,14 @@ fn strata_of(z: Option<&Categories>, sides: [&Categories; 2], rows: &[u32]) -> S
     let stratum = |r: u32| z.map_or(0, |z| z.of[r as usize]);
     let [of_x, of_y] = sides.map(|side| {
         let mut of = vec![0; side.count];
-        rows.iter().for_each(|&r| of[side.of[r as usize] as usize] = stratum(r));
+        for &r in rows {
+            of[side.of[r as usize] as usize] = stratum(r);
+        }
         of
     });
-    rows.iter().for_each(|&r| sizes[stratum(r) as usize] += 1);
+    for &r in rows {
+        sizes[stratum(r) as usize] += 1;
+    }
     Strata { of_x, of_y, sizes }
 }
 

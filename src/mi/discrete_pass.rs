@@ -112,7 +112,9 @@ impl OnePass for DiscretePass {
         // (K_x − 1)(K_y − 1), summed over the strata of z
         let mut strata: BTreeMap<u32, [f64; 2]> = BTreeMap::new();
         for (side, pairs) in [&sums.xz, &sums.yz].into_iter().enumerate() {
-            pairs.keys().for_each(|&(_, z)| strata.entry(z).or_insert([-1.0; 2])[side] += 1.0);
+            for &(_, z) in pairs.keys() {
+                strata.entry(z).or_insert([-1.0; 2])[side] += 1.0;
+            }
         }
         let degrees: f64 = strata.values().map(|[x, y]| x * y).sum();
         let g = 2.0 * self.rows as f64 * counted.information().max(0.0);
@@ -136,11 +138,15 @@ impl Sums {
     fn strata(&self) -> Strata {
         let of = |pairs: &BTreeMap<(u32, u32), u32>| {
             let mut out = vec![0; pairs.len()];
-            pairs.iter().for_each(|(&(_, z), &at)| out[at as usize] = z);
+            for (&(_, z), &at) in pairs {
+                out[at as usize] = z;
+            }
             out
         };
         let mut sizes = vec![0; self.of_z.keys().map(|&(z, _)| z as usize + 1).max().unwrap_or(0)];
-        self.of_z.iter().for_each(|(&(z, _), &count)| sizes[z as usize] = count);
+        for (&(z, _), &count) in &self.of_z {
+            sizes[z as usize] = count;
+        }
         Strata { of_x: of(&self.xz), of_y: of(&self.yz), sizes }
     }
 }

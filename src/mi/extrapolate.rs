@@ -75,7 +75,7 @@ pub fn extrapolated(mut parts: Vec<PartValue>) -> Option<Extrapolated> {
     let (x, y) = (means.iter().map(|m| m.0).sum::<f64>() / count, means.iter().map(|m| m.1).sum::<f64>() / count);
     let spread: f64 = means.iter().map(|m| (m.0 - x) * (m.0 - x)).sum();
     let slope = means.iter().map(|m| (m.0 - x) * (m.1 - y)).sum::<f64>() / spread;
-    (means.len() > 1 && slope.is_finite()).then(|| Extrapolated { parts, limit: y - slope * x, slope })
+    (means.len() > 1 && slope.is_finite()).then_some(Extrapolated { parts, limit: y - slope * x, slope })
 }
 
 #[cfg(test)]

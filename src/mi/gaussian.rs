@@ -15,7 +15,7 @@
 //!
 //! # Parameters
 //!
-//! None. The interval is a jackknife over at most 50 groups of whole episodes, joined with the scatter √(d_x d_y/2)/n of no
+//! None. The interval is a jackknife over at most 50 groups of whole episodes, joined with the scatter √(`d_x` `d_y`/2)/n of no
 //! dependence: all I that the value lies within t standard errors of, the variance growing with I. The p-value permutes
 //! whole episodes.
 //!

@@ -59,7 +59,9 @@ impl OnePass for GaussianPass {
             return Err(MiError::TooFewSamples { needed, widths: width, found: self.rows });
         }
         let mut total = Moments::new(width);
-        groups.iter().for_each(|group| total.add(group, 1.0));
+        for group in &groups {
+            total.add(group, 1.0);
+        }
         let mut warnings = notes.to_vec();
         let Chosen { columns, given, dx, dy } = self.chosen(&total, labels, &mut warnings)?;
         let left = |moments: &Moments| moments.covariance().picked(&columns).given(given, COLLINEAR);

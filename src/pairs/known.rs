@@ -2,8 +2,11 @@
 
 use std::fs::File;
 use std::path::Path;
+use std::sync::Arc;
 
-use polars::prelude::{Column, DataFrame, NamedFrom as _, ParquetCompression, ParquetWriter, PolarsResult, Series};
+use polars::prelude::{
+    Column, DataFrame, NamedFrom as _, ParquetCompression, ParquetWriter, PlSmallStr, PolarsResult, Series,
+};
 use rayon::prelude::*;
 
 use super::PairsError;
@@ -67,7 +70,7 @@ impl Known {
             IoError::os("write", path)(std::io::Error::other(message))
         };
         let file = File::create(path).map_err(IoError::os("create", path))?;
-        let schema = self.group(0, 0).map_err(unwritten)?.schema().clone();
+        let schema = Arc::clone(self.group(0, 0).map_err(unwritten)?.schema());
         let writer = ParquetWriter::new(file).with_compression(ParquetCompression::Uncompressed);
         let mut writer = writer.batched(&schema).map_err(unwritten)?;
         let groups = self.rows.div_ceil(GROUP);
@@ -117,7 +120,7 @@ pub fn is_known(path: &Path) -> bool {
     use polars::prelude::{ParquetReader, SerReader as _};
     let Ok(file) = File::open(path) else { return false };
     let schema = io::caught(|| ParquetReader::new(file).schema());
-    schema.is_some_and(|schema| schema.is_ok_and(|s| s.iter_names().map(|name| name.as_str()).eq(COLUMNS)))
+    schema.is_some_and(|schema| schema.is_ok_and(|s| s.iter_names().map(PlSmallStr::as_str).eq(COLUMNS)))
 }
 
 #[cfg(test)]

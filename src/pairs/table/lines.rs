@@ -112,7 +112,7 @@ mod tests {
     fn pieces(text: &str, size: usize) -> Vec<String> {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("t.csv");
-        std::fs::write(&path, text).unwrap();
+        crate::io::write_atomic(&path, text.as_bytes()).unwrap();
         let text = |piece: Result<Vec<u8>, PairsError>| String::from_utf8(piece.unwrap()).unwrap();
         Lines::open(&path, size).unwrap().map(text).collect()
     }
@@ -143,7 +143,7 @@ mod tests {
     fn a_quotation_mark_without_its_pair_is_an_error_before_memory_is_full() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("t.csv");
-        std::fs::write(&path, format!("a,b\n1,\"{}", "2,3\n".repeat(9 << 20))).unwrap();
+        crate::io::write_atomic(&path, format!("a,b\n1,\"{}", "2,3\n".repeat(9 << 20)).as_bytes()).unwrap();
         let found: Vec<_> = Lines::open(&path, 1 << 20).unwrap().collect();
         let error = found[0].as_ref().unwrap_err().to_string();
         assert!(error.contains("a line of more than 16 MiB, or a quotation mark without its pair: /"), "{error}");

@@ -1,6 +1,7 @@
 //! Parquet.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use polars::io::parquet::metadata::FileMetadataRef;
 use polars::prelude::{DataFrame, ParquetReader, SerReader as _};
@@ -39,7 +40,7 @@ impl TableFile for Parquet {
     fn size(&self, columns: &[&str]) -> Result<Option<u64>, PairsError> {
         let mut reader = ParquetReader::new(open(&self.0)?);
         let metadata = reader.get_metadata().map_err(unreadable(FORM, &self.0))?;
-        let chunks = metadata.row_groups.iter().flat_map(|group| group.parquet_columns());
+        let chunks = metadata.row_groups.iter().flat_map(|group| group.parquet_columns().iter());
         let own = chunks.filter(|chunk| {
             let root = chunk.descriptor().path_in_schema.first();
             root.is_some_and(|root| columns.contains(&root.as_str()))
@@ -64,12 +65,10 @@ impl TableFile for Parquet {
             slices.extend((0..rows).step_by(step).map(|at| (start + at, step.min(rows - at))));
             start += rows;
         }
-        let (path, metadata) = (&self.0, metadata.clone());
-        Ok(Some(Box::new(
-            slices.into_iter().map(move |slice| {
-                Ok(Box::new(Slice { path, metadata: metadata.clone(), slice }) as Box<dyn TableFile>)
-            }),
-        )))
+        let (path, metadata) = (&self.0, Arc::clone(metadata));
+        Ok(Some(Box::new(slices.into_iter().map(move |span| {
+            Ok(Box::new(Slice { path, metadata: Arc::clone(&metadata), span }) as Box<dyn TableFile>)
+        }))))
     }
 }
 
@@ -78,19 +77,19 @@ struct Slice<'a> {
     path: &'a Path,
     metadata: FileMetadataRef,
     /// First row, and how many.
-    slice: (usize, usize),
+    span: (usize, usize),
 }
 
 impl TableFile for Slice<'_> {
     fn names(&self) -> Result<Vec<String>, PairsError> {
         let mut reader = ParquetReader::new(open(self.path)?);
-        reader.set_metadata(self.metadata.clone());
+        reader.set_metadata(Arc::clone(&self.metadata));
         let schema = reader.schema().map_err(unreadable(FORM, self.path))?;
         Ok(schema.iter_names().map(ToString::to_string).collect())
     }
 
     fn read(&self, columns: &[&str]) -> Result<DataFrame, PairsError> {
-        read(self.path, columns, Some((self.slice, &self.metadata)))
+        read(self.path, columns, Some((self.span, &self.metadata)))
     }
 }
 
@@ -103,7 +102,7 @@ fn read(
     let columns = columns.iter().map(|c| (*c).to_owned()).collect();
     let mut reader = ParquetReader::new(open(path)?).with_columns(Some(columns));
     if let Some((slice, metadata)) = slice {
-        reader.set_metadata(metadata.clone());
+        reader.set_metadata(Arc::clone(metadata));
         reader = reader.with_slice(Some(slice));
     }
     reader.finish().map_err(unreadable(FORM, path))

@@ -93,7 +93,7 @@ pub fn pass(
                 Some(Err(error)) => Err(moved(error, read.before)),
             }
         })?;
-        let columns = [&read.options.x, &read.options.y, &read.options.given].map(|list| list.as_slice()).concat();
+        let columns = [&read.options.x, &read.options.y, &read.options.given].map(Vec::as_slice).concat();
         let columns = columns.join(", ");
         let path = paths[0].clone();
         let Some(mut sample) = last else {
@@ -291,13 +291,12 @@ impl Words {
             return Err(PairsError::Mixed { name: name.to_owned(), row: before + 1, path: path.to_owned() });
         };
         let texts = texts.str().map_err(unreadable("table", path))?;
-        let mut number = |text: &str| match known.get(text) {
-            Some(&number) => number,
-            None => {
-                let next = known.len() as u32;
+        let mut number = |text: &str| {
+            let next = known.len() as u32;
+            known.get(text).copied().unwrap_or_else(|| {
                 known.insert(text.to_owned(), next);
                 next
-            }
+            })
         };
         let numbers: Vec<Option<u32>> = texts.iter().map(|text| text.map(&mut number)).collect();
         Ok(Series::new(name.into(), numbers).into())
@@ -337,7 +336,7 @@ mod tests {
         }
         let dir = tempfile::tempdir().unwrap();
         let paths = ["t.csv", "t.parquet"].map(|name| dir.path().join(name));
-        std::fs::write(&paths[0], &text).unwrap();
+        crate::io::write_atomic(&paths[0], text.as_bytes()).unwrap();
         let options = polars::prelude::CsvReadOptions::default().with_infer_schema_length(None);
         let reader = options.into_reader_with_file_handle(std::io::Cursor::new(text));
         let mut frame = reader.finish().unwrap();
@@ -419,9 +418,10 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("t.csv");
         let fails = |text: &str| {
-            std::fs::write(&path, text).unwrap();
-            let error = pass(&[path.clone()], &of("a", "b", &[]), PieceSize { rows: 1, bytes: 40 }, &mut |_, _| ())
-                .unwrap_err();
+            crate::io::write_atomic(&path, text.as_bytes()).unwrap();
+            let error =
+                pass(std::slice::from_ref(&path), &of("a", "b", &[]), PieceSize { rows: 1, bytes: 40 }, &mut |_, _| ())
+                    .unwrap_err();
             error.to_string()
         };
         let lines = |n: usize, line: &str| format!("{line}\n").repeat(n);
@@ -442,7 +442,11 @@ mod tests {
         assert!(fails("a,b\n").starts_with("the table has no rows"), "{}", fails("a,b\n"));
         assert!(fails("a,c\n1,2\n").starts_with("no column \"b\""), "{}", fails("a,c\n1,2\n"));
         // a column without a value in some pieces is neither
-        std::fs::write(&path, format!("a,b\n{}{}{}", lines(30, ",2"), lines(30, "x,2"), lines(30, ",2"))).unwrap();
+        crate::io::write_atomic(
+            &path,
+            format!("a,b\n{}{}{}", lines(30, ",2"), lines(30, "x,2"), lines(30, ",2")).as_bytes(),
+        )
+        .unwrap();
         let (all, words, passed) = joined(&path, &of("a", "b", &[]), PieceSize { rows: 1, bytes: 40 });
         assert_eq!((all.len(), words, passed.rows), (30, vec![true, false], 90));
     }
