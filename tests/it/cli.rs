@@ -126,7 +126,7 @@ fn force_replaces_manual_pages_and_tables_of_ours_and_nothing_else() {
     assert_eq!(run(&["generate", "man", "--out", &at("man")]).0, 0);
     assert_eq!(run(&["generate", "man", "--out", &at("man")]).0, 2);
     assert_eq!(run(&["generate", "man", "--out", &at("man"), "--force"]).0, 0);
-    std::fs::write(at("man/ccmarl-list.1"), "my notes").unwrap();
+    ccmarl::io::write_atomic(at("man/ccmarl-list.1").as_ref(), b"my notes").unwrap();
     let (code, _, err) = run(&["generate", "man", "--out", &at("man"), "--force"]);
     assert!(code == 1 && err.contains("refusing to replace what ccmarl did not make"), "{err}");
     let table = ["generate", "table", "--rows", "1000", "--rho", "-0.5", "--out"];
@@ -137,7 +137,7 @@ fn force_replaces_manual_pages_and_tables_of_ours_and_nothing_else() {
     assert_eq!(run(&[&table[..], &[&at("t.parquet")]].concat()).0, 2);
     assert_eq!(run(&[&table[..], &[&at("t.parquet"), "--force"]].concat()).0, 0);
     assert_eq!(std::fs::read(at("t.parquet")).unwrap(), first);
-    std::fs::write(at("mine.parquet"), "mine").unwrap();
+    ccmarl::io::write_atomic(at("mine.parquet").as_ref(), b"mine").unwrap();
     let (code, _, err) = run(&[&table[..], &[&at("mine.parquet"), "--force"]].concat());
     assert!(code == 1 && err.contains("refusing to replace what ccmarl did not make"), "{err}");
     for (words, message) in [

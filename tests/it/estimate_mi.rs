@@ -605,7 +605,7 @@ fn calibrate_prints_errors_and_refuses_unknown_tasks() {
     let (code, _, err) = calibrate(&args);
     assert!(code == 2 && err.contains("output exists: give --force to replace it"), "{err}");
     assert_eq!(calibrate(&[&args[..], &["--force"]].concat()).0, 0);
-    std::fs::write(&table, "mine\n").unwrap();
+    ccmarl::io::write_atomic(table.as_ref(), b"mine\n").unwrap();
     let (code, _, err) = calibrate(&[&args[..], &["--force"]].concat());
     assert!(code != 0 && std::fs::read_to_string(&table).unwrap() == "mine\n", "{err}");
     let (code, _, err) = calibrate(&["--out", "rows.txt"]);

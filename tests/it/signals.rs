@@ -115,7 +115,7 @@ fn estimates_that_are_finished_outlive_a_signal() {
     let line = |of: &dyn Fn(usize) -> String| (0..70).map(of).collect::<Vec<_>>().join(",") + "\n";
     let row = |r: usize| line(&|c: usize| ((r * (c + 7) * 7919 + c * 104_729) % 1009).to_string());
     let text = line(&|c| format!("c{c}")) + &(0..500).map(row).collect::<String>();
-    std::fs::write(at("wide.csv"), text).unwrap();
+    ccmarl::io::write_atomic(at("wide.csv").as_ref(), text.as_bytes()).unwrap();
     let wide = at("wide.csv");
     let out = at("rows.json");
     let words = ["estimate-mi", &wide, "--all-pairs", "--estimator", "ksg", "--format", "json", "--out", &out];
