@@ -30,10 +30,10 @@ covers: share of the 95 % intervals that hold the truth (a bound's interval is a
 right: tasks whose mean is within a tenth of the truth, or 0.03 nats.
 The checks are draws of two small kinds, the same for every --n. normal-W-W-RHO: 500 samples of W normal columns on
 either side, the first pair correlated by RHO; covers should be 95 %. series-PHI-C: 1000 rows of two AR(1) series with
-coefficient PHI, y following x by C, 39 shifts; p <= 0.05 should be 5 % or less at C = 0 (false positives), and is the power at C > 0.";
+coefficient PHI, y following x by C, 99 shifts; p <= 0.05 should be 5 % or less at C = 0 (false positives), and is the power at C > 0.";
 
 /// Permutations behind the p-values of the checks: the fewest that can reach 0.05 with some room.
-const PERMUTATIONS: usize = 39;
+const PERMUTATIONS: usize = 99;
 /// Draws per check when all tasks are run.
 const CHECKS: u32 = 100;
 /// `--task` that leaves all tasks out.

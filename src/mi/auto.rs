@@ -23,7 +23,8 @@
 //!
 //! # When it fails
 //!
-//! The largest of several values leans upwards by about their scatter: 0.01 nats at n = 5000 without dependence. Where all
+//! The largest of several values leans upwards by about their scatter: 0.01 nats at n = 5000 without dependence, more where samples
+//! are not independent. Where all
 //! of them are too low it is too low: spirals in three columns and more.
 //!
 //! # Reference
@@ -82,6 +83,7 @@ impl Estimator for Auto {
         let choice = choose(samples);
         let scored = choice.scores.then(|| in_scores(samples));
         let mut rows = Vec::new();
+        let asked = choice.estimators.len() as f64;
         for name in &choice.estimators {
             let built = find("estimator", ESTIMATORS, name).and_then(|entry| (entry.build)(&Spec::new(name)));
             // the names are our own: there is nothing to report
@@ -89,13 +91,12 @@ impl Estimator for Auto {
             // the last row of `discrete` is the corrected one
             rows.extend(estimator.estimate(scored.as_ref().unwrap_or(samples), protocol, &seeds.child(name))?.pop());
         }
+        let least = rows.iter().map(|r| r.p_value).try_fold(1.0, |least: f64, p| Some(least.min(p?)));
         // a copula that does not fit is no answer, and one without tails is gcmi's
         rows.retain(|r| !r.warnings.iter().any(|w| w.starts_with(MISFIT) || w.starts_with(LIGHT)));
-        let asked = rows.len() as f64;
-        let least = rows.iter().map(|r| r.p_value).try_fold(1.0, |least: f64, p| Some(least.min(p?)));
         let values = rows.iter().map(|r| format!("{} {:.3}", r.estimator, r.value)).collect::<Vec<_>>().join(", ");
         let Some(mut row) = largest(rows) else { return Ok(Vec::new()) };
-        let others = if asked > 1.0 { format!(", the largest of {values}") } else { String::new() };
+        let others = if asked > 1.0 { format!(", the largest of {values} on normal scores") } else { String::new() };
         row.warnings.insert(0, format!("{NOTE}{} chosen: {}{others}", row.estimator, choice.why));
         "auto".clone_into(&mut row.estimator);
         row.p_value = least.map(|p| (p * asked).min(1.0));
@@ -180,7 +181,7 @@ mod tests {
     use crate::rng;
 
     fn one(samples: &Samples) -> Estimate {
-        Auto.estimate(samples, &Protocol { permutations: 59 }, &Seeds::new(1)).unwrap().remove(0)
+        Auto.estimate(samples, &Protocol { permutations: 99 }, &Seeds::new(1)).unwrap().remove(0)
     }
 
     fn column(values: impl Iterator<Item = f64>) -> Vec<Vec<f64>> {

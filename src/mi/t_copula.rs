@@ -8,8 +8,8 @@
 //! Each column is replaced by Q(rank/(n + 1)), Q the quantile function of Student's t with ν degrees of freedom, equal values having the
 //! mean of their ranks. ν and the correlation matrix R of all columns maximise the copula's likelihood. With h the entropy
 //! of a multivariate t distribution, I = h(x) + h(y) − h(x, y); given z: h(x, z) + h(y, z) − h(z) − h(x, y, z). The bias that
-//! normal samples would have (as for `gaussian`) is subtracted. Where the likelihood gains less than 3.32 over ν = ∞
-//! (χ² at one in a hundred), the value is that of `gcmi`.
+//! normal samples would have (as for `gaussian`) is subtracted. Where the likelihood of the effective samples gains less than
+//! 3.32 over ν = ∞ (χ² at one in a hundred), the value is that of `gcmi`, and the interval reaches up to the heaviest tail that is possible.
 //!
 //! # Shapes and units
 //!
@@ -17,13 +17,14 @@
 //!
 //! # Parameters
 //!
-//! None. The interval is from subsamples of whole episodes, fitted anew around ν. The p-value permutes whole episodes and fits
-//! each time, in at most 2000 samples; given z there is none.
+//! None. The interval is from subsamples of whole episodes, ranked and fitted anew around ν; it reaches down to 0 where the p-value
+//! is over 0.05. The p-value permutes whole episodes and fits each time, in at most 2000 samples. Given z there is neither.
 //!
 //! # When it fails
 //!
 //! It is an estimate and no bound: where the copula is another one, the value may be too low or too high. That is looked for: the fitted
-//! density ratio as a critic proves the `infonce` bound in up to 2000 samples, and a value above that bound's interval is warned of.
+//! density ratio as a critic has an `infonce` bound in up to 2000 samples (of those it was fitted to, so a little too good for many
+//! columns and few samples), and a value above that bound's interval is warned of and has no interval. Given z there is no such check.
 //! One ν is shared by all columns. With few distinct values ranks say little.
 //!
 //! # Reference
@@ -42,7 +43,7 @@ use rayon::prelude::*;
 use super::bounds::infonce;
 use super::gcmi::normal_scores;
 use super::interval::{Scatter, block_interval, t_quantile};
-use super::linear::Symmetric;
+use super::linear::{Moments, Symmetric};
 use super::part::{Part, Subsampled};
 use super::prepare::{scales, tied};
 use super::student::{COLLINEAR, Copula, Tail, Widths, correlation, doubled_ranks, identity};
@@ -70,6 +71,8 @@ const COARSE: [f64; 4] = [f64::INFINITY, 8.0, 3.0, 1.3];
 const STEPS: (usize, usize) = (12, 4);
 /// Least gain in log-likelihood over the normal copula: half the 99 % quantile of χ² with one degree of freedom.
 const GAIN: f64 = 3.32;
+/// Loss of log-likelihood up to which a number of degrees of freedom is possible: half the 95 % quantile of that χ².
+const POSSIBLE: f64 = 1.92;
 /// Most samples that a null test fits, and of which all pairs are scored.
 const PART: usize = 2000;
 /// Share of the ceiling ln n above which `InfoNCE` proves too little to compare with.
@@ -79,6 +82,10 @@ pub(super) const MISFIT: &str = "the t copula does not fit";
 
 /// What the note about a copula without tails begins with.
 pub(super) const LIGHT: &str = "note: no tail heavier than normal";
+
+/// Said of every value given z.
+const UNCHECKED: &str =
+    "given z nobody checks whether the t copula fits: no interval, no p-value; compare with gcmi and ksg";
 
 struct TCopula;
 
@@ -96,15 +103,20 @@ impl Estimator for TCopula {
         // what refuses samples, finds copies, and stands when there are no tails
         let mut row = gcmi(Protocol { permutations: 0 })?;
         row.warnings.extend(tied(samples));
-        let ranked = Ranked::new(samples)?;
-        match ranked.fit(&samples.rows) {
-            Some(fit) if row.value.is_finite() => Ok(vec![ranked.heavy(samples, &fit, *protocol, seeds, row)]),
-            _ => {
-                let mut row = Estimate { warnings: row.warnings, ..gcmi(*protocol)? };
-                row.warnings.push(format!("{LIGHT}: the value is that of gcmi"));
-                Ok(vec![row])
-            }
+        if row.value.is_infinite() {
+            return Ok(vec![row]);
         }
+        let ranked = Ranked::new(&normal)?;
+        let fitted = ranked.fit(&samples.rows, row.n_effective / samples.len() as f64);
+        let Fitted::Heavy(fit) = fitted else {
+            let mut light = Estimate { warnings: row.warnings, ..gcmi(*protocol)? };
+            light.warnings.push(format!("{LIGHT}: the value is that of gcmi"));
+            if let (Fitted::Light(Some(fit)), Some(high)) = (fitted, light.interval_high) {
+                light.interval_high = Some(high.max(ranked.information(&fit)));
+            }
+            return Ok(vec![light]);
+        };
+        Ok(vec![ranked.heavy(samples, &fit, *protocol, seeds, row)])
     }
 
     fn takes_given(&self) -> bool {
@@ -116,6 +128,14 @@ impl Estimator for TCopula {
 struct Fit {
     tail: Tail,
     correlation: Symmetric,
+}
+
+/// What the likelihood says of tails.
+enum Fitted {
+    /// The best copula.
+    Heavy(Fit),
+    /// The normal copula will do; the heaviest tail that it is not clearly better than, if any.
+    Light(Option<Fit>),
 }
 
 /// Samples as doubled ranks.
@@ -135,7 +155,14 @@ impl Ranked {
             let kept = scales(columns, &samples.rows, label, &mut Vec::new())?;
             let all = (0..columns.rows()).map(|r| columns.row(r));
             let data: Vec<f64> = all.flat_map(|row| kept.iter().map(move |s| row[s.column])).collect();
-            Ok((doubled_ranks(&data, kept.len(), &samples.rows), kept.len()))
+            let mut moments = Moments::new(kept.len());
+            samples.rows.iter().for_each(|&r| moments.add_row(&data[r as usize * kept.len()..][..kept.len()]));
+            // a function of the columns before it has no ranks of its own
+            let own: Vec<bool> = moments.covariance().cholesky(COLLINEAR).pivots.iter().map(|p| *p > 0.0).collect();
+            let width = own.iter().filter(|own| **own).count();
+            let data: Vec<f64> =
+                data.iter().zip(own.iter().cycle()).filter(|(_, own)| **own).map(|(v, _)| *v).collect();
+            Ok((doubled_ranks(&data, width, &samples.rows), width))
         };
         let given = samples.labels.given.as_deref().unwrap_or_default();
         let of_z = samples.z.as_ref().map_or(Ok((Vec::new(), 0)), |z| side(z, given))?;
@@ -186,15 +213,21 @@ impl Ranked {
         Copula { tail, correlation, widths: self.widths }
     }
 
-    /// The best copula of `rows`, if its tail is heavier than normal.
-    fn fit(&self, rows: &[u32]) -> Option<Fit> {
+    /// The information of a fitted copula, nats.
+    fn information(&self, fit: &Fit) -> f64 {
+        self.copula(&fit.tail, &fit.correlation).information()
+    }
+
+    /// The best copula of `rows`; a log-likelihood counts for the `independent` share of them.
+    fn fit(&self, rows: &[u32], independent: f64) -> Fitted {
         let fit = |degrees: f64, start: Option<&Symmetric>| {
             let tail = self.tail(degrees);
             let quantiles = self.quantiles(&tail, rows, rows);
             let none = identity(self.widths.all());
             let steps = if start.is_some() { STEPS.1 } else { STEPS.0 };
             let correlation = correlation(&quantiles, &tail, start.unwrap_or(&none), steps);
-            let likelihood = self.copula(&tail, &correlation).log_likelihood(&quantiles) * rows.len() as f64;
+            let likelihood =
+                self.copula(&tail, &correlation).log_likelihood(&quantiles) * rows.len() as f64 * independent;
             (likelihood, Fit { tail, correlation })
         };
         let (normal, first) = fit(f64::INFINITY, None);
@@ -217,8 +250,14 @@ impl Ranked {
             let last = beside(CLOSE * summit([close[0].0, close[1].0, close[2].0]));
             tried.extend(close.into_iter().chain([last]));
         }
-        let (likelihood, best) = tried.into_iter().reduce(|a, b| if b.0 > a.0 { b } else { a })?;
-        (likelihood - normal > GAIN).then_some(best)
+        let most = tried.iter().map(|t| t.0).fold(normal, f64::max);
+        if most - normal > GAIN {
+            let best = tried.into_iter().reduce(|a, b| if b.0 > a.0 { b } else { a });
+            return best.map_or(Fitted::Light(None), |(_, fit)| Fitted::Heavy(fit));
+        }
+        let possible = tried.into_iter().map(|(likelihood, fit)| (most - likelihood <= POSSIBLE, fit));
+        let possible = possible.filter_map(|(possible, fit)| possible.then_some(fit));
+        Fitted::Light(possible.reduce(|a, b| if b.tail.degrees < a.tail.degrees { b } else { a }))
     }
 
     /// The row of a copula with a heavy tail; `row` has what does not depend on it.
@@ -233,19 +272,23 @@ impl Ranked {
         row.n_effective = block_interval(&local, &blocks).n_effective;
         row.warnings.push(format!("{NOTE}{:.1} degrees of freedom", fit.tail.degrees));
         (row.interval_low, row.interval_high) = (None, None);
-        if let Some(of) = self.error(fit, samples, seeds) {
+        if samples.z.is_some() {
+            row.warnings.push(UNCHECKED.to_owned());
+            return row;
+        }
+        let misfit = self.misfit(fit, samples, row.value, seeds);
+        row.p_value = self.p_value(samples, protocol, seeds);
+        if misfit.is_none()
+            && let Some(of) = self.error(fit, samples, seeds)
+        {
             // without dependence some scatter remains, as for gaussian
             let chance = libm::sqrt((widths.x * widths.y) as f64 / 2.0) / row.n_effective;
             let scatter = Scatter { seen, error: of.error, chance, n: row.n_effective };
             let (low, high) = scatter.around(row.value, t_quantile(of.degrees + 1));
+            let low = if row.p_value.is_some_and(|p| p > 0.05) { low.min(0.0) } else { low };
             (row.interval_low, row.interval_high) = (Some(low), Some(high));
         }
-        if samples.z.is_none() {
-            row.warnings.extend(self.misfit(fit, samples, row.value, seeds));
-            row.p_value = self.p_value(samples, protocol, seeds);
-        } else {
-            row.warnings.push(super::given::NO_NULL.to_owned());
-        }
+        row.warnings.extend(misfit);
         row
     }
 
@@ -395,7 +438,7 @@ mod tests {
     fn a_value_that_the_fitted_ratio_does_not_prove_is_warned_of() {
         let (samples, truth) = task("student-identity-2-2-2", 1000);
         let ranked = Ranked::new(&samples).unwrap();
-        let fit = ranked.fit(&samples.rows).unwrap();
+        let Fitted::Heavy(fit) = ranked.fit(&samples.rows, 1.0) else { panic!("a tail") };
         let warning = |value: f64| ranked.misfit(&fit, &samples, value, &Seeds::new(1));
         assert_eq!(warning(truth), None);
         let found = warning(truth + 0.2).unwrap();
@@ -438,7 +481,35 @@ mod tests {
         let mut three = samples_of(&column(0), &column(1));
         three.z = Some(samples_of(&column(2), &column(2)).x);
         let found = one(&three);
-        assert!((found.value - 0.0424).abs() < 0.02 && found.p_value.is_none(), "{found:?}");
+        assert!((found.value - 0.0424).abs() < 0.02, "{found:?}");
+        assert!(found.p_value.is_none() && found.interval_low.is_none(), "{found:?}");
+        assert!(found.warnings.contains(&UNCHECKED.to_owned()), "{found:?}");
+    }
+
+    #[test]
+    fn columns_that_repeat_others_have_no_part_in_the_tail() {
+        // x = (a, e^a) and y independent: were the copy counted, the tail would look heavy (ν = 1.6, 0.117 nats)
+        let none = linear_samples(0.0, 1000, 1, 8);
+        let x: Vec<Vec<f64>> = none.x.data.iter().map(|a| vec![*a, a.exp()]).collect();
+        let y: Vec<Vec<f64>> = none.y.data.iter().map(|b| vec![*b]).collect();
+        let found = one(&samples_of(&x, &y));
+        assert!(found.value < 0.005 && found.interval_low.unwrap() <= 0.0, "{found:?}");
+    }
+
+    #[test]
+    fn a_copula_that_does_not_fit_has_no_interval_and_a_light_tail_reaches_up() {
+        // three columns of one tail beside an independent one: the shared ν invents dependence
+        let (tail, _) = task("student-identity-5-5-2", 1500);
+        let noise = linear_samples(0.0, 1500, 1, 6);
+        let x: Vec<Vec<f64>> = (0..1500).map(|r| tail.x.row(r)[..4].to_vec()).collect();
+        let y: Vec<Vec<f64>> = (0..1500).map(|r| vec![noise.x.row(r)[0]]).collect();
+        let found = one(&samples_of(&x, &y));
+        let warned = found.warnings.iter().any(|w| w.starts_with(MISFIT));
+        assert!(warned == found.interval_low.is_none(), "{found:?}");
+        assert!(warned || found.interval_low.unwrap() <= 0.0, "{found:?}");
+        // 2000 samples do not show 25 degrees of freedom, whose information is 0.00078
+        let light = one(&linear_samples(0.0, 2000, 1, 5));
+        assert!(light.interval_high.unwrap() > 0.00078, "{light:?}");
     }
 
     #[test]
