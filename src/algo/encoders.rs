@@ -55,17 +55,27 @@ impl Encoders {
     ) {
         let width: usize = actors.encoders.iter().map(Mlp::outputs).sum();
         messages.resize(rows * width, 0.0);
-        scratch.senders.resize_with(actors.encoders.len(), Sender::default);
         let mut at = 0;
-        for (j, (encoder, sender)) in actors.encoders.iter().zip(&mut scratch.senders).enumerate() {
-            let input = seen(actors, j, observations);
-            let sent = encoder.forward_packed(&self.packed[j], input, rows, &mut sender.passes);
-            let own = encoder.outputs();
+        for (j, encoder) in actors.encoders.iter().enumerate() {
+            let (own, sent) =
+                (encoder.outputs(), self.encode_of(actors, j, (seen(actors, j, observations), rows), scratch));
             for (to, from) in messages.chunks_exact_mut(width).zip(sent.chunks_exact(own)) {
                 to[at..at + own].copy_from_slice(from);
             }
             at += own;
         }
+    }
+
+    /// What learner `j` alone sends on `rows` rows of its `input`, `[rows, message]`; the same bits as among all.
+    pub(super) fn encode_of<'s>(
+        &self,
+        actors: &Actors,
+        j: usize,
+        (input, rows): (Input<'_>, usize),
+        scratch: &'s mut EncoderScratch,
+    ) -> &'s [f32] {
+        scratch.senders.resize_with(actors.encoders.len(), Sender::default);
+        actors.encoders[j].forward_packed(&self.packed[j], input, rows, &mut scratch.senders[j].passes)
     }
 
     /// Sets the gradients of all encoders to zero.
@@ -122,7 +132,8 @@ impl EncoderScratch {
     }
 }
 
-/// The part of rows of all observations that learner `j` sees.
+/// The part of rows of all observations, of which there may be none, that learner `j` sees.
 fn seen<'a>(actors: &Actors, j: usize, rows: &'a [f32]) -> Input<'a> {
-    Input { data: &rows[actors.observation_offset(j)..], stride: actors.observation.iter().sum() }
+    let data = rows.get(actors.observation_offset(j)..).unwrap_or(&[]);
+    Input { data, stride: actors.observation.iter().sum() }
 }
