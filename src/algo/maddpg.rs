@@ -23,7 +23,7 @@
 
 use super::batch::{Batch, Tile, Widths};
 use super::config::{ActorStep, MaddpgConfig};
-use super::{Actors, EncoderScratch, Sight, Team, TeamScratch};
+use super::{Actors, EncoderScratch, Senders, Sight, Team, TeamScratch};
 use crate::nn::{Activation, Adam, AdamConfig, Mlp, NnError, Packed, Params, Passes, TILE, clip_norm};
 use crate::rng::Seeds;
 use crate::schema::AgentSpec;
@@ -84,27 +84,6 @@ pub struct Networks {
     pub target_actors: Params,
     /// Target of the critic.
     pub target_critic: Params,
-}
-
-/// A learner's encoders, laid out for sending while nobody changes them.
-#[derive(Debug)]
-pub struct Senders<'a> {
-    actors: &'a Actors,
-    team: &'a Team,
-    scratch: &'a mut EncoderScratch,
-}
-
-impl Senders<'_> {
-    /// What all learners send on `rows` rows of all observations `[rows, O]`, into `messages` `[rows, M]`.
-    pub fn encode(&mut self, observations: &[f32], rows: usize, messages: &mut Vec<f32>) {
-        self.team.encode(self.actors, (observations, rows), self.scratch, messages);
-    }
-
-    /// What learner `j` alone sends on `rows` rows of its own observations, `[rows, message]`; the same bits as among
-    /// all.
-    pub fn encode_of(&mut self, j: usize, observations: &[f32], rows: usize) -> &[f32] {
-        self.team.encode_of(self.actors, j, (observations, rows), self.scratch)
-    }
 }
 
 /// Networks laid out for the kernels, and buffers; reused, so that updates allocate nothing once they are warm.
@@ -641,28 +620,6 @@ mod tests {
         assert!(found.actor_grad_norm.is_nan() && found.encoder_grad_norm.unwrap().is_nan(), "{found:?}");
         let [nan, one] = [f32::NAN, 1.0];
         assert!(larger(nan, one).is_nan() && larger(one, nan).is_nan() && larger(one, 2.0) == 2.0);
-    }
-
-    #[test]
-    fn messages_of_one_sender_are_those_among_all_and_of_no_rows_there_are_none() {
-        let agents = agents(3);
-        let agents: Vec<&AgentSpec> = agents.iter().collect();
-        let config = MaddpgConfig { messages: Messages::Encoder, message_width: Some(3), ..MaddpgConfig::default() };
-        let mut learner = Maddpg::new(&agents, Activation::Tanh, config, &Seeds::new(4)).unwrap();
-        let (batch, mut all) = (batch(150, 3), Vec::new());
-        let mut senders = learner.senders().unwrap();
-        senders.encode(&batch.observations, 150, &mut all);
-        assert_eq!(all.len(), 150 * 9);
-        for (j, at) in [0, 3, 7].into_iter().enumerate() {
-            let own = batch.observations.chunks_exact(12).flat_map(|row| &row[at..at + 3 + j]).copied();
-            let own: Vec<f32> = own.collect();
-            let among: Vec<f32> = all.chunks_exact(9).flat_map(|row| &row[3 * j..3 * j + 3]).copied().collect();
-            assert_eq!(senders.encode_of(j, &own, 150), among);
-        }
-        senders.encode(&[], 0, &mut all);
-        assert!(all.is_empty() && senders.encode_of(2, &[], 0).is_empty());
-        let plain = MaddpgConfig::default();
-        assert!(Maddpg::new(&agents, Activation::Tanh, plain, &Seeds::new(4)).unwrap().senders().is_none());
     }
 
     #[test]

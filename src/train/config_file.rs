@@ -130,3 +130,15 @@ fn line_of(text: &str, error: &str) -> Option<usize> {
         .find_map(|name| text.lines().position(|line| gives(line, name)))
         .map(|line| line + 1)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_mark_stands_below_its_place_behind_a_tab_and_behind_what_is_shown_escaped() {
+        assert_eq!(excerpt(12, 3, "\ta = 1"), "12 |  a = 1\n   |   ^");
+        assert_eq!(excerpt(3, 3, "\u{1b}ab"), format!("3 | \\u{{1b}}ab\n  | {:>8}", "^"));
+        assert_eq!(excerpt(3, 161, &"é".repeat(200)), format!("3 | {}\n  | ", "é".repeat(160)));
+    }
+}

@@ -267,7 +267,7 @@ fn what_cannot_be_is_refused_and_what_is_left_out_is_filled_in() {
     let layers = refused(|c| c.maddpg.encoder_hidden = Some(vec![8, 0]));
     assert_eq!(layers, "maddpg.encoder_hidden: expected at most 16 layers of 1 to 4096 units, found [8, 0]");
     let many = refused(|c| c.maddpg.encoder_hidden = Some(vec![4096; 16]));
-    let found = "found 758009352: make layers narrower";
+    let found = "found 755467859: make layers narrower";
     assert_eq!(many, format!("maddpg.hidden: expected at most 268435456 parameters in all networks, {found}"));
     let alone = refused(|c| c.scenario = Spec::new("simple_spread").with("agents", 1));
     assert_eq!(alone, "maddpg.messages: an encoder learns through who hears it, found 1 learner: set \"observation\"");
