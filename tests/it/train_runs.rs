@@ -254,8 +254,9 @@ fn what_a_file_names_is_built_for_the_scenario_that_the_flags_leave() {
     let dir = tempfile::tempdir().unwrap();
     let [trace, file, out] =
         ["two.csv", "part.toml", "run"].map(|name| dir.path().join(name).to_str().unwrap().to_owned());
-    let rows = (0..5 * 26).map(|at| format!("{0},{1},0,1,1\n{0},{1},1,0,1\n", at / 26, at % 26)).collect::<String>();
-    write_atomic(Path::new(&trace), format!("episode,step,sender,receiver,delivered\n{rows}").as_bytes()).unwrap();
+    let rows: Vec<String> = (0..5 * 26).map(|at| format!("{0},{1},0,1,1\n{0},{1},1,0,1\n", at / 26, at % 26)).collect();
+    write_atomic(Path::new(&trace), format!("episode,step,sender,receiver,delivered\n{}", rows.concat()).as_bytes())
+        .unwrap();
     let text = format!("# of two\nprior = {{ name = \"trace\", path = \"{trace}\" }}\n");
     let train = |text: &str, flags: &[&str]| {
         write_atomic(Path::new(&file), text.as_bytes()).unwrap();
