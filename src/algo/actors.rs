@@ -221,11 +221,16 @@ impl Actors {
         for (i, agent) in learners.iter().enumerate() {
             let expected = [agent.observation, agent.action];
             let found = [self.observation[i], self.networks[i].outputs()];
-            if expected != found || self.networks[i].inputs() != self.input(i) {
+            let name = &agent.name;
+            if expected != found {
                 return fail(format!(
-                    "{} has observation and action widths {expected:?}, the trained actor {found:?}",
-                    agent.name
+                    "{name} has observation and action widths {expected:?}, the trained actor {found:?}"
                 ));
+            }
+            let [sent, heard] =
+                [self.input(i), self.networks[i].inputs()].map(|all| all.saturating_sub(self.observation[i]));
+            if sent != heard {
+                return fail(format!("the others send {name} {sent} numbers, its trained actor hears {heard}"));
             }
         }
         Ok(())
@@ -268,5 +273,9 @@ mod tests {
         let error =
             actors.check_fit(&other.iter().collect::<Vec<_>>(), 0.0, Path::new("runs/x")).unwrap_err().to_string();
         assert!(error.contains("b has observation and action widths [5, 2]"), "{error}");
+        let mut deaf = actors;
+        deaf.networks[1] = Mlp::new(&[4, 64, 2], Activation::Relu, Activation::Sigmoid);
+        let error = deaf.check_fit(&agents.iter().collect::<Vec<_>>(), 0.0, Path::new("runs/x")).unwrap_err();
+        assert!(error.to_string().contains("the others send b 3 numbers, its trained actor hears 0"), "{error}");
     }
 }

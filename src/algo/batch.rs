@@ -22,15 +22,6 @@ pub struct Batch {
     pub reward: Vec<f32>,
     /// Shaping bonus stored at rollout `[B]`; zeros when shaping is computed on the minibatch or off.
     pub bonus: Vec<f32>,
-    /// What [`Maddpg::encode_batch`](super::Maddpg::encode_batch) would send now `[B, M]`, for the shaping; empty where a message is the observation.
-    pub messages: Vec<f32>,
-}
-
-impl Batch {
-    /// The messages, whatever they are: `[B, M]`.
-    pub fn sent(&self) -> &[f32] {
-        if self.messages.is_empty() { &self.observations } else { &self.messages }
-    }
 }
 
 /// Consecutive rows of a batch.

@@ -75,6 +75,15 @@ impl MaddpgConfig {
     /// The paper's batch, where nothing else is said.
     pub const BATCH: usize = 1024;
 
+    /// The paper's batch for this many learners in a scenario, where nothing else is said.
+    pub fn batch_of(scenario: &str, learners: usize) -> usize {
+        if scenario == "simple_tag" && learners >= 6 { 512 } else { Self::BATCH }
+    }
+
+    /// Most parameters that a learner's networks may have together. Each takes 20 bytes (online, target, two moments,
+    /// gradient), so that the largest learner takes 5 GiB.
+    pub const MOST_PARAMETERS: usize = 1 << 28;
+
     /// Width of an encoder's message, where nothing else is said.
     pub const MESSAGE_WIDTH: usize = 8;
 

@@ -4,7 +4,7 @@
 //! of that row is set, of what actor i's backward pass gives at the inputs that m^j went into. A lost message gives
 //! nothing. Where a message is the observation there is no encoder, and all of this does nothing.
 
-use super::Actors;
+use super::{Actors, Team};
 use crate::nn::{Input, Mlp, Packed, Passes};
 
 /// Encoders with their parameters laid out.
@@ -55,17 +55,27 @@ impl Encoders {
     ) {
         let width: usize = actors.encoders.iter().map(Mlp::outputs).sum();
         messages.resize(rows * width, 0.0);
-        scratch.senders.resize_with(actors.encoders.len(), Sender::default);
         let mut at = 0;
-        for (j, (encoder, sender)) in actors.encoders.iter().zip(&mut scratch.senders).enumerate() {
-            let input = seen(actors, j, observations);
-            let sent = encoder.forward_packed(&self.packed[j], input, rows, &mut sender.passes);
-            let own = encoder.outputs();
+        for (j, encoder) in actors.encoders.iter().enumerate() {
+            let (own, sent) =
+                (encoder.outputs(), self.encode_of(actors, j, (seen(actors, j, observations), rows), scratch));
             for (to, from) in messages.chunks_exact_mut(width).zip(sent.chunks_exact(own)) {
                 to[at..at + own].copy_from_slice(from);
             }
             at += own;
         }
+    }
+
+    /// What learner `j` alone sends on `rows` rows of its `input`, `[rows, message]`; the same bits as among all.
+    pub(super) fn encode_of<'s>(
+        &self,
+        actors: &Actors,
+        j: usize,
+        (input, rows): (Input<'_>, usize),
+        scratch: &'s mut EncoderScratch,
+    ) -> &'s [f32] {
+        scratch.senders.resize_with(actors.encoders.len(), Sender::default);
+        actors.encoders[j].forward_packed(&self.packed[j], input, rows, &mut scratch.senders[j].passes)
     }
 
     /// Sets the gradients of all encoders to zero.
@@ -122,7 +132,59 @@ impl EncoderScratch {
     }
 }
 
-/// The part of rows of all observations that learner `j` sees.
+/// A learner's encoders, laid out for sending while nobody changes them.
+#[derive(Debug)]
+pub struct Senders<'a> {
+    pub(super) actors: &'a Actors,
+    pub(super) team: &'a Team,
+    pub(super) scratch: &'a mut EncoderScratch,
+}
+
+impl Senders<'_> {
+    /// What all learners send on `rows` rows of all observations `[rows, O]`, into `messages` `[rows, M]`.
+    pub fn encode(&mut self, observations: &[f32], rows: usize, messages: &mut Vec<f32>) {
+        self.team.encode(self.actors, (observations, rows), self.scratch, messages);
+    }
+
+    /// What learner `j` alone sends on `rows` rows of its own observations, `[rows, message]`; the same bits as among
+    /// all.
+    pub fn encode_of(&mut self, j: usize, observations: &[f32], rows: usize) -> &[f32] {
+        self.team.encode_of(self.actors, j, (observations, rows), self.scratch)
+    }
+}
+
+/// The part of rows of all observations, of which there may be none, that learner `j` sees.
 fn seen<'a>(actors: &Actors, j: usize, rows: &'a [f32]) -> Input<'a> {
-    Input { data: &rows[actors.observation_offset(j)..], stride: actors.observation.iter().sum() }
+    let data = rows.get(actors.observation_offset(j)..).unwrap_or(&[]);
+    Input { data, stride: actors.observation.iter().sum() }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::algo::{Maddpg, MaddpgConfig, Messages, agent};
+    use crate::nn::Activation;
+    use crate::rng::Seeds;
+
+    #[test]
+    fn messages_of_one_sender_are_those_among_all_and_of_no_rows_there_are_none() {
+        let agents = [agent("a", 3, 2), agent("b", 4, 2), agent("c", 5, 2)];
+        let agents: Vec<_> = agents.iter().collect();
+        let learner = |messages| {
+            let config = MaddpgConfig { messages, ..MaddpgConfig::default() };
+            Maddpg::new(&agents, Activation::Tanh, config, &Seeds::new(4)).unwrap()
+        };
+        let (mut encoding, mut all) = (learner(Messages::Encoder), Vec::new());
+        let observations: Vec<f32> = (0..150 * 12).map(|at| (at as f32).sin()).collect();
+        let mut senders = encoding.senders().unwrap();
+        senders.encode(&observations, 150, &mut all);
+        assert_eq!(all.len(), 150 * 24);
+        for (j, at) in [0, 3, 7].into_iter().enumerate() {
+            let own: Vec<f32> = observations.chunks_exact(12).flat_map(|row| &row[at..at + 3 + j]).copied().collect();
+            let among: Vec<f32> = all.chunks_exact(24).flat_map(|row| &row[8 * j..8 * j + 8]).copied().collect();
+            assert_eq!(senders.encode_of(j, &own, 150), among);
+        }
+        senders.encode(&[], 0, &mut all);
+        assert!(all.is_empty() && senders.encode_of(2, &[], 0).is_empty());
+        assert!(learner(Messages::Observation).senders().is_none());
+    }
 }

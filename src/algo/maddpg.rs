@@ -23,7 +23,7 @@
 
 use super::batch::{Batch, Tile, Widths};
 use super::config::{ActorStep, MaddpgConfig};
-use super::{Actors, EncoderScratch, Sight, Team, TeamScratch};
+use super::{Actors, EncoderScratch, Senders, Sight, Team, TeamScratch};
 use crate::nn::{Activation, Adam, AdamConfig, Mlp, NnError, Packed, Params, Passes, TILE, clip_norm};
 use crate::rng::Seeds;
 use crate::schema::AgentSpec;
@@ -118,10 +118,7 @@ impl Maddpg {
         config: MaddpgConfig,
         seeds: &Seeds,
     ) -> Result<Self, NnError> {
-        let actors = Actors::new(learners, output, &config);
-        let joint: usize = learners.iter().map(|a| a.observation + a.action).sum();
-        let widths: Vec<usize> = [joint].into_iter().chain(config.hidden.iter().copied()).chain([1]).collect();
-        let critic = Mlp::new(&widths, Activation::Relu, Activation::Identity);
+        let (actors, critic) = shapes(learners, output, &config);
         let actor_params = Params::new(actors.init(&mut seeds.stream("actors")))?;
         let mut critic_params = Vec::new();
         critic.init(&mut seeds.stream("critic"), &mut critic_params);
@@ -140,6 +137,12 @@ impl Maddpg {
             critic,
             scratch: Scratch::default(),
         })
+    }
+
+    /// Parameters that the networks of such a learner have together; none is made.
+    pub fn parameters(learners: &[&AgentSpec], config: &MaddpgConfig) -> usize {
+        let (actors, critic) = shapes(learners, Activation::Tanh, config);
+        actors.parameters() + critic.parameters()
     }
 
     /// One update on a minibatch. `bonus` `[B]` is added to the reward; empty means none.
@@ -170,17 +173,14 @@ impl Maddpg {
         })
     }
 
-    /// What the encoders of now send for `rows` rows of `observations` `[rows, O]`, into `messages` `[rows, M]`; nothing
-    /// where a message is the observation.
-    pub fn encode(&mut self, observations: &[f32], rows: usize, messages: &mut Vec<f32>) {
+    /// The encoders as they are now, laid out for sending; `None` where a message is the observation.
+    pub fn senders(&mut self) -> Option<Senders<'_>> {
+        if !self.actors.encodes() {
+            return None;
+        }
         let Scratch { team, sending, .. } = &mut self.scratch;
         team.load_encoders(&self.actors, &self.params.actors.read());
-        team.encode(&self.actors, (observations, rows), sending, messages);
-    }
-
-    /// Fills in a minibatch's messages as the encoders of now would send them.
-    pub fn encode_batch(&mut self, batch: &mut Batch) {
-        self.encode(&batch.observations, batch.rows, &mut batch.messages);
+        Some(Senders { actors: &self.actors, team, scratch: sending })
     }
 
     /// The mean squared TD error that [`Maddpg::update`] would report for this minibatch and no bonus; learns nothing.
@@ -318,15 +318,27 @@ impl Maddpg {
         for i in 0..n {
             let grads = &mut actor_grads[actors.range(i)];
             team.grads(actors, i, grads);
-            norms[0] = norms[0].max(clip_norm(grads, self.config.grad_clip));
+            norms[0] = larger(norms[0], clip_norm(grads, self.config.grad_clip));
         }
         for j in 0..actors.encoders.len() {
             let grads = &mut actor_grads[actors.encoder_range(j)];
             team.encoder_grads(actors, j, grads);
-            norms[1] = norms[1].max(clip_norm(grads, self.config.grad_clip));
+            norms[1] = larger(norms[1], clip_norm(grads, self.config.grad_clip));
         }
         (objective / (batch.rows * passes_needed) as f64, norms)
     }
+}
+
+/// The shapes of actors and critic.
+fn shapes(learners: &[&AgentSpec], output: Activation, config: &MaddpgConfig) -> (Actors, Mlp) {
+    let joint: usize = learners.iter().map(|a| a.observation + a.action).sum();
+    let widths: Vec<usize> = [joint].into_iter().chain(config.hidden.iter().copied()).chain([1]).collect();
+    (Actors::new(learners, output, config), Mlp::new(&widths, Activation::Relu, Activation::Identity))
+}
+
+/// The larger of two numbers, or the one that is none: a gradient that is no number must not pass for a small one.
+fn larger(a: f32, b: f32) -> f32 {
+    if b > a || b.is_nan() { b } else { a }
 }
 
 /// One Adam step of `online`, and `target`'s step towards it.
@@ -594,6 +606,20 @@ mod tests {
         assert_eq!(found.encoder_grad_norm, Some(0.0));
         let (own, after) = (learner.actors.encoder_range(0).start, learner.params.actors.read());
         assert!(before[own..] == after[own..] && before[..own] != after[..own]);
+    }
+
+    #[test]
+    fn a_gradient_that_is_no_number_is_reported_as_none() {
+        let agents = agents(3);
+        let agents: Vec<&AgentSpec> = agents.iter().collect();
+        let base = MaddpgConfig { messages: Messages::Encoder, ..MaddpgConfig::default() };
+        let config = MaddpgConfig { action_penalty: f32::NAN, ..base };
+        let mut learner = Maddpg::new(&agents, Activation::Tanh, config, &Seeds::new(4)).unwrap();
+        let found = learner.update(&batch(150, 3), &[]).unwrap();
+        assert!(found.actor_objective.is_finite() && found.td_loss.is_finite(), "{found:?}");
+        assert!(found.actor_grad_norm.is_nan() && found.encoder_grad_norm.unwrap().is_nan(), "{found:?}");
+        let [nan, one] = [f32::NAN, 1.0];
+        assert!(larger(nan, one).is_nan() && larger(one, nan).is_nan() && larger(one, 2.0) == 2.0);
     }
 
     #[test]

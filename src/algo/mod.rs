@@ -15,7 +15,7 @@ mod team;
 pub use actors::{Actors, RunPolicyError};
 pub use batch::Batch;
 pub use config::{ActorStep, MaddpgConfig, Masks, Messages};
-pub use encoders::EncoderScratch;
+pub use encoders::{EncoderScratch, Senders};
 pub use maddpg::{Maddpg, UpdateMetrics};
 pub use presets::Preset;
 pub use team::{Sight, Team, TeamScratch};

@@ -86,6 +86,19 @@ impl Team {
         self.encoders.encode(actors, (observations, rows), scratch, messages);
     }
 
+    /// What learner `j` alone sends on `rows` rows of its own observations `[rows, observation]`, `[rows, message]`; the
+    /// same bits as among all.
+    pub(super) fn encode_of<'s>(
+        &self,
+        actors: &Actors,
+        j: usize,
+        (observations, rows): (&[f32], usize),
+        scratch: &'s mut EncoderScratch,
+    ) -> &'s [f32] {
+        let input = Input { data: observations, stride: actors.observation[j] };
+        self.encoders.encode_of(actors, j, (input, rows), scratch)
+    }
+
     /// All actors act on `rows` rows. A row's actions do not depend on the rows beside it, to the bit.
     pub fn act(&self, actors: &Actors, sight: Sight<'_>, rows: usize, scratch: &mut TeamScratch) {
         scratch.members.resize_with(actors.len(), Member::default);

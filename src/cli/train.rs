@@ -71,7 +71,7 @@ pub(super) struct Args {
     /// Run directory to write
     #[arg(long)]
     out: PathBuf,
-    /// Store whose episodes fill replay and rings before the first step
+    /// Store whose episodes fill replay and rings before the first step; messages that encoders make are made anew
     #[arg(long, value_name = "STORE", conflicts_with = "resume")]
     warm_start: Option<PathBuf>,
     /// Store that takes the run's own rollouts; it must not exist, --force does not replace it
@@ -120,7 +120,9 @@ impl Args {
         // the file may leave out what a flag says
         let scenario = self.scenario.spec(None)?;
         let given = Given { algorithm: self.algorithm.as_deref(), scenario: scenario.as_ref() };
-        let file = self.config.as_deref().or(own.as_deref()).map(|path| TrainConfig::read(path, given)).transpose()?;
+        let path = self.config.as_deref().or(own.as_deref());
+        let file = path.map(|path| TrainConfig::read(path, given)).transpose()?;
+        let read = file.clone();
         let mut config = file.unwrap_or_else(|| TrainConfig::new(Spec::new("simple_spread"), "cc-maddpg"));
         if let Some(spec) = self.scenario.spec(Some(config.scenario.clone()))? {
             config.scenario = spec;
@@ -141,6 +143,10 @@ impl Args {
         config.evaluation.every = self.evaluate_every.unwrap_or(config.evaluation.every);
         config.dumie.alpha = self.alpha.or(config.dumie.alpha);
         config.dumie.beta = self.beta.or(config.dumie.beta);
+        // not before the flags: a prior is of the scenario's agents
+        if let (Some(path), Some(read)) = (path, &read) {
+            config.check_plugins(path, read)?;
+        }
         Ok(config)
     }
 }

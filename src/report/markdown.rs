@@ -58,7 +58,8 @@ pub(super) fn grid(returns: &Returns) -> Grid {
     for column in 0..returns.channels.len() {
         let cells: Vec<f64> =
             returns.rows.iter().filter_map(|r| r.cells[column].as_ref()).map(|c| c.loss_rate).collect();
-        losses.push(plain(format!("{:.1} %", 100.0 * crate::stats::mean(&cells))));
+        let mean = format!("{:.1} %", 100.0 * crate::stats::mean(&cells));
+        losses.push(plain(if returns.mixed == Some(column) { "by row".to_owned() } else { mean }));
     }
     lines.push(Line { kind: "loss", cells: losses });
     Grid { header, lines }

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
+use crate::algo::MaddpgConfig;
 use crate::io::printable;
 use crate::report::published::{coefficients, misprints};
 use crate::report::{Published, ReportError, Run, Tables, Task};
@@ -28,6 +29,9 @@ const ALGORITHMS: [&str; 9] = [
 
 /// Fewest seeds that give an interval over seeds.
 const SEEDS_FOR_INTERVAL: usize = 3;
+
+/// The channel that is the link each run trained over: not the same for all rows.
+const OWN_LINK: &str = "prior";
 
 /// Environment steps of the paper's trainings.
 const PUBLISHED_STEPS: u64 = 4_000_000;
@@ -100,6 +104,8 @@ pub struct Returns {
     pub convention: String,
     /// Columns.
     pub channels: Vec<String>,
+    /// The column whose rows are of different links, where there is one: nothing in it is compared.
+    pub mixed: Option<usize>,
     /// Rows.
     pub rows: Vec<Row>,
     /// Reference policies: name, mean, standard deviation over episodes, episodes.
@@ -222,6 +228,8 @@ pub(super) fn table(
     let mut rows = Vec::new();
     let mut shown = Vec::new();
     let mut short: BTreeMap<u64, Vec<String>> = BTreeMap::new();
+    let mut priors: Vec<(String, &Run)> = Vec::new();
+    let mut changed = Vec::new();
     for (name, group) in series(&evaluated)? {
         let cells = channels.iter().map(|channel| cell(&group, channel, tables)).collect::<Vec<_>>();
         for (channel, cell) in channels.iter().zip(&cells) {
@@ -232,9 +240,17 @@ pub(super) fn table(
         if group[0].steps < PUBLISHED_STEPS && cells.iter().flatten().any(|c| c.published.is_some()) {
             short.entry(group[0].steps).or_default().push(name.clone());
         }
+        if cells.iter().flatten().any(|c| c.published.is_some()) {
+            changed.extend(changed_learner(&name, group[0]));
+        }
+        if group.iter().flat_map(|run| &run.episodes).any(|e| e.channel == OWN_LINK) {
+            priors.push((name.clone(), group[0]));
+        }
         rows.push(Row { series: name, seeds: group.iter().map(|r| r.seed).collect(), cells });
     }
-    mark_best(&mut rows, channels.len());
+    let differ = priors.iter().any(|(_, run)| run.prior != priors[0].1.prior);
+    let mixed = channels.iter().position(|channel| differ && channel == OWN_LINK);
+    mark_best(&mut rows, (0..channels.len()).filter(|column| Some(*column) != mixed));
     let mut references = Vec::new();
     if let Some(reference) = reference {
         for (name, values) in [("random", &reference.random), ("oracle", &reference.oracle)] {
@@ -256,6 +272,14 @@ pub(super) fn table(
         let (steps, published) = (thousands(steps), thousands(PUBLISHED_STEPS));
         notes.push(format!("{}: trained for {steps} steps; the paper for {published}.", names.join(", ")));
     }
+    notes.extend(changed);
+    if mixed.is_some() {
+        let of = priors.iter().map(|(name, run)| format!("{name}: {}", printable(&run.prior.to_string())));
+        notes.push(format!(
+            "Channel {OWN_LINK} is another link in each row ({}): its column is no comparison, nothing in it is in bold.",
+            of.collect::<Vec<_>>().join("; ")
+        ));
+    }
     if !references.is_empty() {
         notes.push(
             "random and oracle hear no messages: one value stands for all channels, ± standard deviation over episodes."
@@ -263,7 +287,8 @@ pub(super) fn table(
         );
     }
     notes.extend(misprints(task, &shown));
-    Ok(Some(Returns { task: task.clone(), convention: convention.to_owned(), channels, rows, references, notes }))
+    let (task, convention) = (task.clone(), convention.to_owned());
+    Ok(Some(Returns { task, convention, channels, mixed, rows, references, notes }))
 }
 
 fn cell(group: &[&Run], channel: &str, tables: &Tables) -> Option<Cell> {
@@ -288,6 +313,23 @@ fn cell(group: &[&Run], channel: &str, tables: &Tables) -> Option<Cell> {
     })
 }
 
+/// What a run beside published values changed of the learner, whose defaults are the paper's; settings that its
+/// configuration does not name are those.
+fn changed_learner(name: &str, run: &Run) -> Option<String> {
+    let learners = crate::scenario::build(&run.scenario)
+        .map_or(run.task.agents as usize, |scenario| scenario.agents().iter().filter(|a| a.learner).count());
+    let batch = Some(MaddpgConfig::batch_of(&run.scenario.name, learners));
+    let text = toml::to_string(&MaddpgConfig { batch, ..MaddpgConfig::default() }).ok()?;
+    let plain = crate::registry::dotted(&toml::from_str(&format!("[maddpg]\n{text}")).ok()?);
+    let changed =
+        run.settings.iter().filter(|(key, value)| key.starts_with("maddpg.") && plain.get(*key) != Some(value));
+    let changed: Vec<String> = changed.map(|(key, value)| format!("{key} = {value}")).collect();
+    (!changed.is_empty()).then(|| {
+        let changed = printable(&changed.join(", "));
+        format!("{name}: trained with {changed}; the published row is of the default learner.")
+    })
+}
+
 /// A whole number with a no-break space between thousands.
 fn thousands(number: u64) -> String {
     let digits = number.to_string();
@@ -297,8 +339,8 @@ fn thousands(number: u64) -> String {
 
 /// Marks, per column, the highest mean and every row whose interval reaches into the best one's; only where all rows
 /// have intervals over seeds and there are at least two.
-fn mark_best(rows: &mut [Row], columns: usize) {
-    for column in 0..columns {
+fn mark_best(rows: &mut [Row], columns: impl Iterator<Item = usize>) {
+    for column in columns {
         let cells: Vec<&Cell> = rows.iter().filter_map(|r| r.cells[column].as_ref()).collect();
         if cells.len() < 2 || cells.iter().any(|c| c.interval.is_none()) {
             continue;

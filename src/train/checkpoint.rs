@@ -19,6 +19,11 @@ const ACTORS: &str = "actors.safetensors";
 /// The user's file of the best actors so far, under protocol `standard`.
 pub(super) const BEST: &str = "best.safetensors";
 const STATE: &str = "state.safetensors";
+/// Name of the number below in the state, which is not part of [`visit`]: it says what `visit` will find.
+const LAYOUT: &str = "layout";
+/// What arrays the state has and how long they are. A change of [`visit`], of the columns of metrics or of a number's
+/// meaning takes the next number.
+const VERSION: u64 = 1;
 /// All files of a checkpoint.
 pub(super) const FILES: [&str; 3] = [ACTORS, BEST, STATE];
 
@@ -119,6 +124,7 @@ pub(super) fn save(trainer: &mut Trainer) -> Result<(), TrainError> {
         save_best(trainer, &trainer.tests.best)?;
     }
     let mut arrays = Arrays::default();
+    arrays.put(LAYOUT, &[VERSION]);
     let inconsistent = |message| TrainError::Value { name: "checkpoint".to_owned(), message };
     visit(trainer, &mut |name, slot| {
         match slot {
@@ -152,6 +158,14 @@ pub(super) fn load(trainer: &mut Trainer) -> Result<(), TrainError> {
         return Err(fail("there is no checkpoint; start without --resume".to_owned()));
     }
     let (arrays, json) = Arrays::read(&path).map_err(fail)?;
+    let layout = arrays.get::<u64>(LAYOUT).ok().and_then(|found| found.first().copied());
+    if layout != Some(VERSION) {
+        let found = layout.map_or("none".to_owned(), |found| found.to_string());
+        return Err(fail(format!(
+            "the checkpoint was written by another version of the program (expected layout {VERSION}, found {found}): go on \
+             with that version, or start a new run"
+        )));
+    }
     let config: TrainConfig = serde_json::from_str(&json).map_err(|e| fail(format!("its configuration: {e}")))?;
     let changed = difference::between(&config, &trainer.config)?;
     if !changed.is_empty() {

@@ -4,11 +4,11 @@ use serde::{Deserialize, Serialize};
 
 use super::TrainError;
 use super::protocol::EvaluationConfig;
-use crate::algo::{self, MaddpgConfig, Messages};
+use crate::algo::{self, Maddpg, MaddpgConfig, Messages};
 use crate::registry::Spec;
 use crate::scenario::Scenario;
 
-/// Most hidden layers, and most units in one: what fits in memory many times over.
+/// Most hidden layers, and most units in one. What all networks take together has a bound of its own.
 const WIDEST: [usize; 2] = [16, 4096];
 
 /// Everything a training run depends on. `config.toml` in the run directory is this, fully resolved.
@@ -286,8 +286,9 @@ impl TrainConfig {
         self.prior = Some(resolved(crate::record::build_link(&prior, scenario)?.parameters()));
         let tag = self.scenario.name == "simple_tag";
         let [alpha, beta] = if preset.shaped { [0.01, if tag { 0.001 } else { 0.01 }] } else { [0.0, 0.0] };
-        let learners = scenario.agents().iter().filter(|a| a.learner).count();
-        self.maddpg.batch.get_or_insert(if tag && learners >= 6 { 512 } else { MaddpgConfig::BATCH });
+        let team: Vec<_> = scenario.agents().iter().filter(|a| a.learner).collect();
+        let learners = team.len();
+        self.maddpg.batch.get_or_insert(MaddpgConfig::batch_of(&self.scenario.name, learners));
         self.dumie.alpha.get_or_insert(alpha);
         self.dumie.beta.get_or_insert(beta);
         for (name, weight) in ["dumie.alpha", "dumie.beta"].into_iter().zip(self.weights()) {
@@ -306,6 +307,12 @@ impl TrainConfig {
         self.evaluation.episodes = Some(self.evaluation.episodes());
         self.resolve_encoders(learners)?;
         self.check()?;
+        let (parameters, most) = (Maddpg::parameters(&team, &self.maddpg), MaddpgConfig::MOST_PARAMETERS);
+        if parameters > most {
+            let message =
+                format!("expected at most {most} parameters in all networks, found {parameters}: make layers narrower");
+            return Err(TrainError::Value { name: "maddpg.hidden".to_owned(), message });
+        }
         Ok(self)
     }
 

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use super::TrainError;
 use super::config::TrainConfig;
+use crate::io::{IoError, printable, read_text};
 use crate::registry::{RegistryError, Spec};
 
 /// Largest configuration file that is read, bytes.
@@ -22,30 +23,44 @@ pub struct Given<'a> {
 }
 
 impl TrainConfig {
-    /// Reads a TOML file, which may leave out what is given beside it; a typo is refused with its line, in the tables of
-    /// plugins too.
+    /// Reads a TOML file, which may leave out what is given beside it; a typo is refused with its line. Scenario and prior
+    /// are not built: that is [`TrainConfig::check_plugins`], once all that is given is laid over the file.
     ///
     /// # Errors
     /// [`TrainError::Io`], [`TrainError::Config`].
     pub fn read(path: &Path, given: Given<'_>) -> Result<Self, TrainError> {
-        let text = crate::io::read_text(path, LIMIT)?;
-        let config = Self::from_text(&text, path, given)?;
-        // a plugin's parameters are its own: what it refuses has no place in the file until it is looked for
-        config.check_plugins().map_err(|error| {
-            let line = line_of(&text, &error.to_string());
-            let message = line.map_or_else(|| error.to_string(), |line| format!("line {line}: {error}"));
-            TrainError::Config { message, excerpt: String::new(), path: path.to_owned() }
-        })?;
-        Ok(config)
+        Self::from_text(&file_text(path)?, path, given)
     }
 
-    /// Reads a run's own file, without building its scenario and prior: what those need (the trace of a prior) may be
-    /// gone when the run itself is still good.
+    /// Reads a run's own file. What its scenario and prior need (the trace of a prior) may be gone when the run itself is
+    /// still good.
     ///
     /// # Errors
     /// As [`TrainConfig::read`].
     pub fn parse(path: &Path) -> Result<Self, TrainError> {
-        Self::from_text(&crate::io::read_text(path, LIMIT)?, path, Given::default())
+        Self::read(path, Given::default())
+    }
+
+    /// Builds scenario and prior. What one is refused for that stands in the file at `path` as it is here, as `read` from
+    /// there says, is told with its line.
+    ///
+    /// # Errors
+    /// [`TrainError::Config`] for what the file says, [`TrainError::Registry`] for what was given beside it.
+    pub fn check_plugins(&self, path: &Path, read: &Self) -> Result<(), TrainError> {
+        // a plugin's parameters are its own: what it refuses has no place in the file until it is looked for
+        let placed = |error: RegistryError, own: bool| {
+            if !own {
+                return error.into();
+            }
+            let line = file_text(path).ok().and_then(|text| line_of(&text, &error.to_string()));
+            let message = line.map_or_else(|| error.to_string(), |line| format!("line {line}: {error}"));
+            TrainError::Config { message, excerpt: String::new(), path: path.to_owned() }
+        };
+        let scenario =
+            crate::scenario::build(&self.scenario).map_err(|error| placed(error, self.scenario == read.scenario))?;
+        let Some(prior) = &self.prior else { return Ok(()) };
+        let built = crate::record::build_link(prior, scenario.as_ref());
+        built.map(|_| ()).map_err(|error| placed(error, self.prior == read.prior))
     }
 
     fn from_text(text: &str, path: &Path, given: Given<'_>) -> Result<Self, TrainError> {
@@ -57,24 +72,36 @@ impl TrainConfig {
         let line = |(key, value): (&str, Option<&str>)| Some(format!("{key} = {}\n", toml::Value::from(value?)));
         let before: String = missing.filter_map(line).collect();
         toml::from_str(&format!("{before}{text}")).map_err(|error| {
+            let message = error.message().trim().replace('\n', "; ");
             let place = error.span().and_then(|span| place(text, span.start.checked_sub(before.len())?));
             let (at, excerpt) = match place {
-                Some((line, column, code)) => {
-                    let (width, code) = (line.to_string().len(), code.chars().take(SHOWN).collect::<String>());
-                    let mark = if column > SHOWN { String::new() } else { format!("{:>column$}", "^") };
-                    (format!("line {line}, column {column}: "), format!("{line} | {code}\n{:width$} | {mark}", ""))
+                // nothing that stands there is wrong
+                Some((line, column, _)) if message.starts_with("missing field") => {
+                    (format!("line {line}, column {column}: "), String::new())
                 }
+                Some((line, column, code)) => (format!("line {line}, column {column}: "), excerpt(line, column, code)),
                 None => Default::default(),
             };
-            let message = format!("{at}{}", error.message().trim().replace('\n', "; "));
-            TrainError::Config { message, excerpt, path: path.to_owned() }
+            TrainError::Config { message: format!("{at}{message}"), excerpt, path: path.to_owned() }
         })
     }
+}
 
-    fn check_plugins(&self) -> Result<(), RegistryError> {
-        let scenario = crate::scenario::build(&self.scenario)?;
-        self.prior.as_ref().map_or(Ok(()), |prior| crate::record::build_link(prior, scenario.as_ref()).map(|_| ()))
+/// A file's text without the mark that some editors put before it.
+fn file_text(path: &Path) -> Result<String, IoError> {
+    let mut text = read_text(path, LIMIT)?;
+    if text.starts_with('\u{feff}') {
+        text.drain(..'\u{feff}'.len_utf8());
     }
+    Ok(text)
+}
+
+/// A line as it is shown, a tab as one space and what a terminal obeys escaped, and a mark below its column.
+fn excerpt(line: usize, column: usize, code: &str) -> String {
+    let shown = |characters: usize| printable(&code.chars().take(characters).collect::<String>().replace('\t', " "));
+    let (width, at) = (line.to_string().len(), shown(column - 1).chars().count() + 1);
+    let mark = if column > SHOWN { String::new() } else { format!("{:>at$}", "^") };
+    format!("{line} | {}\n{:width$} | {mark}", shown(SHOWN), "")
 }
 
 /// Line and column (in characters) of a byte of `text`, from 1, and the line itself.
@@ -102,4 +129,16 @@ fn line_of(text: &str, error: &str) -> Option<usize> {
         .filter(|name| !name.is_empty())
         .find_map(|name| text.lines().position(|line| gives(line, name)))
         .map(|line| line + 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_mark_stands_below_its_place_behind_a_tab_and_behind_what_is_shown_escaped() {
+        assert_eq!(excerpt(12, 3, "\ta = 1"), "12 |  a = 1\n   |   ^");
+        assert_eq!(excerpt(3, 3, "\u{1b}ab"), format!("3 | \\u{{1b}}ab\n  | {:>8}", "^"));
+        assert_eq!(excerpt(3, 161, &"é".repeat(200)), format!("3 | {}\n  | ", "é".repeat(160)));
+    }
 }

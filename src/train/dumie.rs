@@ -6,14 +6,15 @@
 //! links, or each link has its own. Values are per sample; negatives are cyclic shifts of the action at fixed message,
 //! so none is its own partner, or all actions of the minibatch.
 //!
-//! Where encoders make the messages, rings hold what was sent at rollout, as does shaping at rollout; what is computed
-//! from replay (shaping on a minibatch, pairs from replay) sees what the encoders of now would send.
+//! Where encoders make the messages, rings hold what was sent at rollout, as does shaping at rollout, and may be older
+//! than the encoders; what is computed from replay (shaping on a minibatch, pairs from replay) sees what the encoders of
+//! now would send. So with pairs from replay JSD and CLUB are of the code as it is, their held-out values of pairs as sent.
 
 use super::TrainError;
 use super::config::{DumieConfig, Estimators, LostMessage, PairSource, Shaping};
 use super::estimator::{Class, Estimator, Nets, Pairs, Place};
 use super::replay::Replay;
-use crate::algo::{Batch, Maddpg};
+use crate::algo::{Batch, Senders};
 use crate::rng::{self, Seeds, Stream};
 use crate::schema::{Episode, Layout};
 
@@ -39,7 +40,8 @@ pub struct Dumie {
     config: DumieConfig,
     weights: [f64; 2],
     learners: Vec<usize>,
-    /// Where each learner's message and action lie in a transition.
+    /// Where each learner's observation, message and action lie in a transition.
+    observation: Vec<Place>,
     message: Vec<Place>,
     action: Vec<Place>,
     nets: Nets,
@@ -49,8 +51,8 @@ pub struct Dumie {
     pub club: Vec<Estimator>,
     /// A minibatch's pairs, by class and estimator.
     pairs: [Vec<Pairs>; 2],
-    /// Of pairs from replay, all observations and what encoders make of them.
-    seen: Vec<f32>,
+    /// Of pairs from replay, what each sender saw, and what its encoder makes of it, sender after sender.
+    seen: Vec<Vec<f32>>,
     sent: Vec<f32>,
 }
 
@@ -70,7 +72,7 @@ impl Dumie {
             };
             learners.iter().map(place).collect()
         };
-        let (message, action) = (places(|a| a.message), places(|a| a.action));
+        let (observation, message, action) = (places(|a| a.observation), places(|a| a.message), places(|a| a.action));
         let widest = |places: &[Place]| places.iter().map(|p| p[1]).max().unwrap_or(1).max(1);
         let widths = [widest(&message), widest(&action)];
         let links = learners.len() * learners.len().saturating_sub(1);
@@ -91,8 +93,8 @@ impl Dumie {
         }
         let [jsd, club] = made;
         let pairs = [(); 2].map(|()| (0..count).map(|_| Pairs::default()).collect());
-        let [seen, sent] = [Vec::new(), Vec::new()];
-        Ok(Self { config, weights, learners, message, action, nets, jsd, club, pairs, seen, sent })
+        let (seen, sent) = (vec![Vec::new(); learners.len()], Vec::new());
+        Ok(Self { config, weights, learners, observation, message, action, nets, jsd, club, pairs, seen, sent })
     }
 
     /// Every estimator with its name: `jsd`, `club`, or with the link's number behind it (sender by receiver).
@@ -132,15 +134,15 @@ impl Dumie {
     }
 
     /// k steps of each estimator whose ring is full enough, and what they report. With a stream for them, held-out
-    /// values come first, from the pairs observed since the last call; they change nothing else. `encoder` is whose
-    /// encoders make the messages, `None` where a message is the observation.
+    /// values come first, from the pairs observed since the last call; they change nothing else. `senders` make
+    /// the messages of pairs from replay; `None` where a message is the observation.
     ///
     /// # Errors
     /// [`TrainError::Nn`].
     pub fn train(
         &mut self,
         replay: &Replay,
-        mut encoder: Option<&mut Maddpg>,
+        mut senders: Option<&mut Senders<'_>>,
         rng: &mut Stream,
         heldout: Option<&mut Stream>,
     ) -> Result<DumieMetrics, TrainError> {
@@ -157,7 +159,7 @@ impl Dumie {
         for step in 0..self.config.k {
             for (at, class) in [(0, Class::Delivered), (2, Class::Lost)] {
                 for index in 0..self.jsd.len() {
-                    let value = self.learn((class, index), replay, encoder.as_deref_mut(), rng)?;
+                    let value = self.learn((class, index), replay, senders.as_deref_mut(), rng)?;
                     // what is reported is the last step's
                     value.into_iter().filter(|_| step + 1 == self.config.k).for_each(|value| count(at, value));
                 }
@@ -173,7 +175,7 @@ impl Dumie {
         &mut self,
         (class, index): (Class, usize),
         replay: &Replay,
-        encoder: Option<&mut Maddpg>,
+        senders: Option<&mut Senders<'_>>,
         rng: &mut Stream,
     ) -> Result<Option<f64>, TrainError> {
         let estimators = if class == Class::Delivered { &mut self.jsd } else { &mut self.club };
@@ -185,11 +187,13 @@ impl Dumie {
             return self.nets.learn(class, estimator, self.config.batch, rng).map(Some);
         }
         let mut pairs = std::mem::take(&mut self.pairs[0][index]);
-        let mut seen = encoder.is_some().then(|| std::mem::take(&mut self.seen));
-        let found = self.filter((class, index), replay, rng, &mut pairs, seen.as_mut());
-        let messages = match (encoder, seen) {
-            (Some(learner), Some(seen)) => {
-                learner.encode(&seen, pairs.len(), &mut self.sent);
+        let mut seen = senders.is_some().then(|| std::mem::take(&mut self.seen));
+        let found = self.filter((class, index), replay, rng, &mut pairs, seen.as_deref_mut());
+        let messages = match (senders, seen) {
+            (Some(senders), Some(seen)) => {
+                if found {
+                    self.encode(senders, &seen);
+                }
                 self.seen = seen;
                 &self.sent
             }
@@ -203,22 +207,34 @@ impl Dumie {
         Ok(value)
     }
 
+    /// What the senders of a minibatch of pairs send on what each of them saw, where [`Self::filter`] said it would lie.
+    fn encode(&mut self, senders: &mut Senders<'_>, seen: &[Vec<f32>]) {
+        let all: usize = self.message.iter().map(|p| p[1]).sum();
+        self.sent.resize(self.config.batch * all, 0.0);
+        for (j, seen) in seen.iter().enumerate() {
+            let ([start, _], rows) = (self.message[j], seen.len() / self.observation[j][1].max(1));
+            let sent = senders.encode_of(j, seen, rows);
+            self.sent[self.config.batch * start..][..sent.len()].copy_from_slice(sent);
+        }
+    }
+
     /// Draws pairs of one class from all of replay; false when it hardly has any. Messages lie in replay's observations,
-    /// or with `seen`, which takes all observations of each pair, in what encoders make of those.
+    /// or with `seen`, which takes what the sender of each pair saw, in what the encoders make of that: room for a
+    /// minibatch per sender.
     fn filter(
         &self,
         (class, index): (Class, usize),
         replay: &Replay,
         rng: &mut Stream,
         pairs: &mut Pairs,
-        mut seen: Option<&mut Vec<f32>>,
+        mut seen: Option<&mut [Vec<f32>]>,
     ) -> bool {
         let n = self.learners.len();
-        let sent: usize = self.message.iter().map(|p| p[1]).sum();
         pairs.clear();
         pairs.reserve(self.config.batch);
-        if let Some(seen) = &mut seen {
+        for (seen, [_, width]) in seen.iter_mut().flat_map(|seen| seen.iter_mut()).zip(&self.observation) {
             seen.clear();
+            seen.reserve(self.config.batch * width);
         }
         for _ in 0..TRIES * self.config.batch {
             let transition = rng::below(rng, replay.len());
@@ -228,12 +244,17 @@ impl Dumie {
             let [observed, action, bits] = replay.places(transition);
             let delivered = replay.link[bits + j * n + i];
             if delivered == (class == Class::Delivered) {
-                let row = seen.as_mut().map_or(observed, |seen| {
-                    seen.extend_from_slice(replay.observed(transition));
-                    pairs.len() * sent
-                });
-                let [message, to] = self.pair(delivered, j, i);
-                pairs.push([row + message[0], message[1]], [action + to[0], to[1]], 0);
+                let [[start, width], to] = self.pair(delivered, j, i);
+                let start = match &mut seen {
+                    None => observed + start,
+                    Some(seen) => {
+                        let [from, own] = self.observation[j];
+                        let row = seen[j].len() / own.max(1);
+                        seen[j].extend_from_slice(&replay.observations[observed + from..][..own]);
+                        self.config.batch * start + row * self.message[j][1]
+                    }
+                };
+                pairs.push([start, width], [action + to[0], to[1]], transition);
                 if pairs.len() == self.config.batch {
                     return true;
                 }
@@ -254,11 +275,16 @@ impl Dumie {
         if self.config.jsd_shift { shifted } else { shifted - 2.0 * core::f64::consts::LN_2 }
     }
 
-    /// The shaping bonus of each transition of a minibatch, `[B]`.
-    pub fn bonus(&mut self, batch: &Batch, rng: &mut Stream, bonus: &mut Vec<f32>) {
+    /// The shaping bonus of each transition of a minibatch, `[B]`; `messages` are all learners', `[B, M]`: their
+    /// observations, or what their encoders send.
+    ///
+    /// # Panics
+    /// When `messages` has another length: what was not encoded must not pass for a message.
+    pub fn bonus(&mut self, batch: &Batch, messages: &[f32], rng: &mut Stream, bonus: &mut Vec<f32>) {
         let n = self.learners.len();
         let width = |places: &[Place]| places.iter().map(|p| p[1]).sum::<usize>();
         let (m, a) = (width(&self.message), width(&self.action));
+        assert_eq!(messages.len(), batch.rows * m, "a message per learner and transition");
         let mut classes = std::mem::take(&mut self.pairs);
         for pairs in classes.iter_mut().flatten() {
             pairs.clear();
@@ -286,7 +312,7 @@ impl Dumie {
                 if weight == 0.0 || !learned || pairs.len() < 2 {
                     continue;
                 }
-                self.nets.evaluate(class, estimator, pairs, [batch.sent(), &batch.actions], rng);
+                self.nets.evaluate(class, estimator, pairs, [messages, &batch.actions], rng);
                 for (&row, value) in pairs.rows.iter().zip(&self.nets.values) {
                     bonus[row as usize] += weight as f32 * (value - shift);
                 }
@@ -302,15 +328,16 @@ impl Dumie {
             // negatives are cyclic shifts: in the order of time all would lie equally far off
             let order = rng::permutation(rng, episode.steps);
             let (mut batch, links) = (Batch { rows: episode.steps, ..Batch::default() }, self.learners.len().pow(2));
+            let mut messages = Vec::new();
             for &row in &order {
                 for &agent in &self.learners {
-                    batch.messages.extend_from_slice(episode.messages[agent].row(row));
+                    messages.extend_from_slice(episode.messages[agent].row(row));
                     batch.actions.extend_from_slice(episode.actions[agent].row(row));
                 }
                 batch.link.extend_from_slice(&episode.link[row * links..(row + 1) * links]);
             }
             let mut found = Vec::new();
-            self.bonus(&batch, rng, &mut found);
+            self.bonus(&batch, &messages, rng, &mut found);
             bonus.resize(episode.steps, 0.0);
             order.iter().zip(found).for_each(|(&row, value)| bonus[row] = value);
         }
@@ -326,7 +353,7 @@ fn link(n: usize, j: usize, i: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::algo::{MaddpgConfig, Messages};
+    use crate::algo::{Maddpg, MaddpgConfig, Messages};
     use crate::nn::{Activation, Tape};
     use crate::schema::{AgentSpec, Controller, Matrix};
     use crate::train::config::Negatives;
@@ -369,7 +396,7 @@ mod tests {
     }
 
     fn replay(episodes: u64) -> Replay {
-        let mut replay = Replay::new(&layout(), 25, 10_000).unwrap();
+        let mut replay = Replay::new(&layout(), 25, 10_000, false).unwrap();
         (0..episodes).for_each(|index| replay.push(&episode(index), &[]).unwrap());
         replay
     }
@@ -454,22 +481,42 @@ mod tests {
         let mut learner = Maddpg::new(&agents, Activation::Tanh, encoder, &Seeds::new(1)).unwrap();
         layout.agents.iter_mut().for_each(|agent| agent.message = 3);
         let config = DumieConfig { pairs: PairSource::Replay, ..config() };
-        let dumie = Dumie::new(&layout, config, [1.0, 1.0], &Seeds::new(1)).unwrap();
+        let mut dumie = Dumie::new(&layout, config, [1.0, 1.0], &Seeds::new(1)).unwrap();
         let (replay, mut rng, mut pairs) = (replay(20), Seeds::new(3).stream("f"), Pairs::default());
-        let (mut seen, mut sent, mut tape) = (Vec::new(), Vec::new(), Tape::default());
+        let (mut seen, mut tape) = (vec![Vec::new(); 2], Tape::default());
         assert!(dumie.filter((Class::Delivered, 0), &replay, &mut rng, &mut pairs, Some(&mut seen)));
-        learner.encode(&seen, pairs.len(), &mut sent);
-        let [x, y] = pairs.of([&sent, &replay.actions]);
-        let (actors, params) = (&learner.actors, learner.params.actors.read());
+        dumie.encode(&mut learner.senders().unwrap(), &seen);
+        let [x, y] = pairs.of([&dumie.sent, &replay.actions]);
+        let (actors, params) = (&learner.actors, learner.params.actors.read().to_vec());
+        let mut from = [0, 0];
         for pair in 0..256 {
-            let (start, width) = (x.starts[pair] as usize, x.widths[pair]);
-            let sender = start % 6 / 3;
-            let heard = seen[2 * pair + sender];
-            assert_eq!((start, width), (6 * pair + 3 * sender, 3));
-            assert_eq!(y.data[y.starts[pair] as usize], heard, "on delivered links the receiver does what it heard");
-            let exact = actors.encoders[sender].forward(&params[actors.encoder_range(sender)], &[heard], 1, &mut tape);
-            assert!(exact.iter().zip(&sent[start..]).all(|(a, b)| (a - b).abs() < 1e-6));
+            // who acts is the receiver, and what it does is what the other saw
+            let action = y.starts[pair] as usize;
+            let (transition, sender) = (action / 2, 1 - action % 2);
+            assert_eq!(pairs.rows[pair] as usize, transition);
+            let saw = replay.observations[replay.places(transition)[0] + sender];
+            assert_eq!(y.data[action], saw, "on delivered links the receiver does what it heard");
+            let exact = actors.encoders[sender].forward(&params[actors.encoder_range(sender)], &[saw], 1, &mut tape);
+            let (sent, width) = (&x.data[x.starts[pair] as usize..], x.widths[pair]);
+            assert!(width == 3 && exact.iter().zip(sent).all(|(a, b)| (a - b).abs() < 1e-6), "pair {pair}");
+            from[sender] += 1;
         }
+        assert!(from.iter().all(|&pairs| pairs > 50) && pairs.len() == 256, "{from:?}");
+        // a class that replay does not have teaches nothing, whoever would have sent
+        let mut lossless = replay.clone();
+        lossless.link.fill(true);
+        (0..60).for_each(|index| dumie.observe(&sent(&mut learner, episode(index))));
+        let metrics = dumie.train(&lossless, learner.senders().as_mut(), &mut rng, None).unwrap();
+        assert!(metrics.jsd.is_some() && metrics.club.is_none(), "{metrics:?}");
+    }
+
+    /// The episode with what the learner's encoders make of its observations.
+    fn sent(learner: &mut Maddpg, mut episode: Episode) -> Episode {
+        let mut senders = learner.senders().unwrap();
+        for (j, message) in episode.messages.iter_mut().enumerate() {
+            *message = Matrix { data: senders.encode_of(j, &episode.observations[j].data, 26).to_vec(), width: 3 };
+        }
+        episode
     }
 
     #[test]
@@ -482,20 +529,27 @@ mod tests {
             ..Batch::default()
         };
         let bonus = |weights, delivered| {
-            let mut out = Vec::new();
-            trained(weights).bonus(&row(delivered), &mut Seeds::new(5).stream("b"), &mut out);
+            let (batch, mut out) = (row(delivered), Vec::new());
+            trained(weights).bonus(&batch, &batch.observations, &mut Seeds::new(5).stream("b"), &mut out);
             out
         };
         let [one, two] = [bonus([1.0, 0.0], true), bonus([2.0, 5.0], true)];
         assert!(one.iter().all(|&b| b != 0.0) && one.iter().zip(&two).all(|(a, b)| (2.0 * a - b).abs() < 1e-5));
         assert_eq!(bonus([1.0, 0.0], false), [0.0, 0.0]);
         // what encoders sent stands in for the observations
-        let sent = Batch { observations: vec![9.0; 4], messages: row(true).observations, ..row(true) };
+        let seen = Batch { observations: vec![9.0; 4], ..row(true) };
         let mut encoded = Vec::new();
-        trained([1.0, 0.0]).bonus(&sent, &mut Seeds::new(5).stream("b"), &mut encoded);
+        trained([1.0, 0.0]).bonus(&seen, &row(true).observations, &mut Seeds::new(5).stream("b"), &mut encoded);
         assert_eq!(encoded, one);
         let [one, two] = [bonus([0.0, 1.0], false), bonus([9.0, 2.0], false)];
         assert!(one.iter().all(|&b| b != 0.0) && one.iter().zip(&two).all(|(a, b)| (2.0 * a - b).abs() < 1e-5));
+    }
+
+    #[test]
+    #[should_panic(expected = "a message per learner and transition")]
+    fn messages_that_were_not_made_do_not_pass_for_observations() {
+        let batch = Batch { rows: 2, link: vec![true; 8], actions: vec![0.0; 4], ..Batch::default() };
+        trained([1.0, 0.0]).bonus(&batch, &[], &mut Seeds::new(5).stream("b"), &mut Vec::new());
     }
 
     #[test]

@@ -25,7 +25,7 @@ pub(super) enum Class {
 pub(super) struct Pairs {
     messages: [Vec<u32>; 2],
     actions: [Vec<u32>; 2],
-    /// Which transition of the batch each pair belongs to.
+    /// Which transition of the minibatch, or of replay, each pair belongs to.
     pub(super) rows: Vec<u32>,
 }
 

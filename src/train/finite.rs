@@ -14,6 +14,7 @@ pub(super) fn first_not_finite(trainer: &Trainer) -> Option<String> {
         ("minibatch.next_observations", &batch.next_observations),
         ("minibatch.actions", &batch.actions),
         ("minibatch.reward", &batch.reward),
+        ("minibatch.messages", &trainer.sent),
     ] {
         if let Some(found) = whole(name, values) {
             return Some(found);

@@ -15,10 +15,14 @@ pub const METRIC_COLUMNS: [(&str, &str); 16] = [
     ("critic_grad_norm", "mean L2 norm of the critic's gradient before clipping"),
     ("actor_grad_norm", "mean of the largest actor gradient norm before clipping"),
     ("encoder_grad_norm", "mean of the largest message encoder's gradient norm before clipping"),
-    ("jsd", "JSD value of the estimator's minibatches (shifted scale unless configured), not nats"),
-    ("jsd_heldout", "JSD value of pairs that the critic had not learned from"),
-    ("club", "CLUB value of the estimator's minibatches, nats"),
-    ("club_heldout", "CLUB value of pairs that q had not learned from, nats"),
+    (
+        "jsd",
+        "JSD value of the estimator's minibatches (shifted scale unless configured), not nats; messages as sent, or with \
+pairs = \"replay\" as message encoders would send them now",
+    ),
+    ("jsd_heldout", "JSD value of pairs that the critic had not learned from; messages as sent"),
+    ("club", "CLUB value of the estimator's minibatches, nats; messages as for jsd"),
+    ("club_heldout", "CLUB value of pairs that q had not learned from, nats; messages as sent"),
     ("shaping_mean", "mean shaping bonus per transition"),
     ("shaping_std", "standard deviation of the shaping bonus over the minibatch"),
     ("loss_rate", "share of messages lost in the training episodes since the last row"),

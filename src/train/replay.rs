@@ -20,9 +20,8 @@ pub struct Replay {
     pub capacity: usize,
     /// Episodes pushed so far.
     pub pushed: u64,
-    /// Whether messages are made by encoders: updates compute them anew from the observations, and what an episode says
-    /// was sent is not looked at. Otherwise a message must be the sender's observation.
-    pub encoded: bool,
+    /// Whether messages are made by encoders.
+    encoded: bool,
     learners: Vec<usize>,
     names: Vec<String>,
     /// Widths of a row: observations, actions, links.
@@ -42,11 +41,13 @@ pub struct Replay {
 }
 
 impl Replay {
-    /// An empty memory for episodes of this layout; learners must be the communicators.
+    /// An empty memory for episodes of this layout; learners must be the communicators. `encoded` says whether encoders
+    /// make the messages: updates compute them anew from the observations, and what an episode says was sent is not
+    /// looked at. Otherwise a message must be the sender's observation.
     ///
     /// # Errors
     /// [`TrainError::Store`] when learners and communicators differ, or `capacity` is less than an episode.
-    pub fn new(layout: &Layout, steps: usize, capacity: usize) -> Result<Self, TrainError> {
+    pub fn new(layout: &Layout, steps: usize, capacity: usize, encoded: bool) -> Result<Self, TrainError> {
         let learners = layout.learners();
         if learners.is_empty() || learners != layout.communicators() {
             return Err(TrainError::Store("the learners must be the communicators, and at least one".to_owned()));
@@ -61,7 +62,7 @@ impl Replay {
             steps,
             capacity: capacity / steps,
             pushed: 0,
-            encoded: false,
+            encoded,
             names: learners.iter().map(|&a| layout.agents[a].name.clone()).collect(),
             widths: [own[0].iter().sum(), own[1].iter().sum(), learners.len() * learners.len()],
             own,
@@ -245,12 +246,6 @@ impl Replay {
         [row * o, transition * a, row * l]
     }
 
-    /// A transition's observations, of all learners.
-    pub(super) fn observed(&self, transition: usize) -> &[f32] {
-        let [at, ..] = self.places(transition);
-        &self.observations[at..at + self.widths[0]]
-    }
-
     /// Gives each row of `batch` the link bits of another transition, for o and o' alike ([`Masks::Redrawn`]).
     ///
     /// [`Masks::Redrawn`]: crate::algo::Masks::Redrawn
@@ -273,7 +268,6 @@ impl Replay {
             &mut batch.actions,
             &mut batch.reward,
             &mut batch.bonus,
-            &mut batch.messages,
         ] {
             buffer.clear();
         }
@@ -404,7 +398,7 @@ mod tests {
 
     #[test]
     fn a_sampled_transition_is_one_row_and_its_successor_also_after_the_ring_wrapped() {
-        let mut replay = Replay::new(&layout(), 4, 12).unwrap();
+        let mut replay = Replay::new(&layout(), 4, 12, false).unwrap();
         for index in 0..5 {
             replay.push(&episode(index, 4), &[]).unwrap();
         }
@@ -425,7 +419,7 @@ mod tests {
 
     #[test]
     fn redrawn_links_are_those_of_some_transition_for_both_observations() {
-        let mut replay = Replay::new(&layout(), 4, 12).unwrap();
+        let mut replay = Replay::new(&layout(), 4, 12, false).unwrap();
         (0..3).for_each(|index| replay.push(&episode(index, 4), &[]).unwrap());
         let (mut batch, mut rng) = (Batch::default(), Seeds::new(1).stream("s"));
         replay.sample(&mut rng, 500, &mut batch);
@@ -443,7 +437,7 @@ mod tests {
 
     #[test]
     fn episodes_that_cannot_train_are_refused_by_name() {
-        let mut replay = Replay::new(&layout(), 4, 12).unwrap();
+        let mut replay = Replay::new(&layout(), 4, 12, false).unwrap();
         let error = replay.push(&episode(0, 3), &[]).unwrap_err().to_string();
         assert!(error.contains("episode 0 has 3 steps, the trainer needs 4"), "{error}");
         let mut other = episode(7, 4);

@@ -44,7 +44,7 @@ pub struct Report {
     pub next_critic_loss: Option<f64>,
     /// Whether it was stopped before its last step.
     pub interrupted: bool,
-    /// Whether it had taken its last step before: nothing was left to do.
+    /// Whether it had taken its last step before: no step was left, only what of its tests was missing.
     pub was_finished: bool,
     /// Files of earlier tests that were removed when the run went on, and that it did not write anew.
     #[serde(skip_serializing_if = "Vec::is_empty")]

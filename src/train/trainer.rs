@@ -18,7 +18,7 @@ use crate::algo::{Batch, Maddpg, MaddpgConfig, Masks};
 use crate::link::Link;
 use crate::nn::Activation;
 use crate::record::{ActionNoise, Recording, Trained, build_link, check_link, loss_rate};
-use crate::rng::Seeds;
+use crate::rng::{Seeds, Stream};
 use crate::scenario::{self, Scenario};
 use crate::schema::{Episode, Layout, Manifest};
 use crate::storage::EpisodeSink;
@@ -48,6 +48,8 @@ pub struct Trainer {
     pub(super) tests: Tests,
     pub(super) clock: Clock,
     pub(super) batch: Batch,
+    /// What encoders make of the minibatch, where shaping asks for it.
+    pub(super) sent: Vec<f32>,
     bonus: Vec<f32>,
 }
 
@@ -86,9 +88,8 @@ impl Trainer {
         let output = if scenario.space().decoder.low() < 0.0 { Activation::Tanh } else { Activation::Sigmoid };
         let mut learner = Maddpg::new(&learners, output, config.maddpg.clone(), &seeds)?;
         learner.actors.scenario = scenario.parameters();
-        let mut replay = Replay::new(&layout, scenario.steps(), config.replay)?;
+        let replay = Replay::new(&layout, scenario.steps(), config.replay, learner.actors.encodes())?;
         if learner.actors.encodes() {
-            replay.encoded = true;
             let sent = layout.agents.iter_mut().filter(|a| a.learner).zip(&learner.actors.message);
             sent.for_each(|(agent, width)| agent.message = *width);
         }
@@ -123,6 +124,7 @@ impl Trainer {
             tests: Tests::default(),
             clock: Clock::default(),
             batch: Batch::default(),
+            sent: Vec::new(),
             bonus: Vec::new(),
         })
     }
@@ -141,7 +143,8 @@ impl Trainer {
         Manifest { planned, ..Manifest::new(self.config.seed, scenario, link, policy, &self.layout) }
     }
 
-    /// Puts an episode into replay and rings, as if it had been rolled out here.
+    /// Puts an episode into replay and rings, as if it had been rolled out here: the messages in it are those that this
+    /// run sends.
     ///
     /// # Errors
     /// [`TrainError::Store`] when it does not fit.
@@ -214,7 +217,7 @@ impl Trainer {
     }
 
     /// Draws the minibatch of update number `update`.
-    fn draw(&mut self, update: u64) -> crate::rng::Stream {
+    fn draw(&mut self, update: u64) -> Stream {
         let mut rng = self.seeds.indexed_stream("update", update);
         let rows = self.config.maddpg.batch.unwrap_or(MaddpgConfig::BATCH);
         self.replay.sample(&mut rng, rows, &mut self.batch);
@@ -239,15 +242,14 @@ impl Trainer {
         Some(self.learner.td_loss(&self.batch))
     }
 
-    /// One update of estimators, critic and actors.
-    fn learn(&mut self) -> Result<(), TrainError> {
-        let mut rng = self.draw(self.update);
-        let report = (self.update + 1).is_multiple_of(self.config.log_every);
+    /// Trains the estimators, and makes the bonus of the minibatch at hand.
+    fn shape(&mut self, rng: &mut Stream, report: bool) -> Result<(), TrainError> {
         self.bonus.clear();
+        self.sent.clear();
         if let Some(dumie) = &mut self.dumie {
             let mut heldout = report.then(|| self.seeds.indexed_stream("heldout", self.update));
-            let encoder = self.learner.actors.encodes().then_some(&mut self.learner);
-            let found = dumie.train(&self.replay, encoder, &mut rng, heldout.as_mut())?;
+            let mut senders = self.learner.senders();
+            let found = dumie.train(&self.replay, senders.as_mut(), rng, heldout.as_mut())?;
             for (name, value) in [
                 ("jsd", found.jsd),
                 ("jsd_heldout", found.jsd_heldout),
@@ -258,8 +260,11 @@ impl Trainer {
             }
             match self.config.dumie.shaping {
                 Shaping::Minibatch => {
-                    self.learner.encode_batch(&mut self.batch);
-                    dumie.bonus(&self.batch, &mut rng, &mut self.bonus);
+                    let messages = senders.map_or(&self.batch.observations, |mut senders| {
+                        senders.encode(&self.batch.observations, self.batch.rows, &mut self.sent);
+                        &self.sent
+                    });
+                    dumie.bonus(&self.batch, messages, rng, &mut self.bonus);
                 }
                 Shaping::AtRollout => self.bonus.clone_from(&self.batch.bonus),
             }
@@ -269,6 +274,14 @@ impl Trainer {
             self.means.add("shaping_mean", mean);
             self.means.add("shaping_std", variance.sqrt());
         }
+        Ok(())
+    }
+
+    /// One update of estimators, critic and actors.
+    fn learn(&mut self) -> Result<(), TrainError> {
+        let mut rng = self.draw(self.update);
+        let report = (self.update + 1).is_multiple_of(self.config.log_every);
+        self.shape(&mut rng, report)?;
         self.redraw_masks(self.update);
         let found = self.learner.update(&self.batch, &self.bonus)?;
         self.stale = true;
@@ -337,5 +350,50 @@ impl Trainer {
     /// Mean training return of the last logging interval.
     pub(super) fn return_mean(&self) -> Option<f64> {
         self.metrics.last().and_then(|row| row.values[0])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::algo::Messages;
+    use crate::registry::Spec;
+
+    /// A run with encoders, up to where its estimators shape.
+    fn shaped() -> Trainer {
+        let mut config = TrainConfig::new(Spec::new("simple_spread").with("agents", 2), "cc-maddpg");
+        (config.maddpg.messages, config.maddpg.message_width, config.maddpg.batch) =
+            (Messages::Encoder, Some(3), Some(64));
+        (config.dumie.batch, config.dumie.start, config.steps) = (64, 200, 4000);
+        let mut trainer = Trainer::new(config.resolve().unwrap(), Path::new("unused")).unwrap();
+        while trainer.update < 20 {
+            trainer.advance(None).unwrap();
+        }
+        trainer
+    }
+
+    fn bonus(trainer: &mut Trainer) -> Vec<f32> {
+        let mut rng = trainer.draw(trainer.update);
+        trainer.shape(&mut rng, false).unwrap();
+        trainer.bonus.clone()
+    }
+
+    #[test]
+    fn the_bonus_of_a_minibatch_goes_by_what_the_encoders_of_now_send() {
+        let [mut one, mut same, mut other] = [(); 3].map(|()| shaped());
+        let encoders = other.learner.actors.encoder_range(0).start..;
+        let faster = |params: &mut [f32]| params[encoders].iter_mut().for_each(|p| *p *= 1.5);
+        other.learner.params.actors.update(faster).unwrap();
+        let [a, b, c] = [&mut one, &mut same, &mut other].map(bonus);
+        assert!(a.len() == 64 && a == b && a.iter().any(|&v| v != 0.0), "{a:?}");
+        assert!(a.iter().zip(&c).filter(|(a, c)| a != c).count() > 32, "{a:?} and {c:?}");
+        // nothing but the messages differs, and they are the encoders'
+        let learner = |t: &Trainer| t.dumie.as_ref().unwrap().jsd[0].params.read().to_vec();
+        assert_eq!((&one.batch.observations, learner(&one)), (&other.batch.observations, learner(&other)));
+        let mut exact = Vec::new();
+        other.learner.senders().unwrap().encode(&one.batch.observations, 64, &mut exact);
+        assert!(other.sent == exact && one.sent != exact && exact.len() == 64 * 6);
+        other.sent[7] = f32::NAN;
+        assert_eq!(finite::first_not_finite(&other).unwrap(), "minibatch.messages");
     }
 }

@@ -63,7 +63,7 @@ fn main() {
         // decoded: observations, messages, actions and the team reward as f32, a byte per link
         let decoded = rows * (4 * floats(&layout, false) + layout.communicators().len().pow(2) as u64);
         line("read into replay", Some(decoded), &|| {
-            let mut replay = Replay::new(&layout, scenario.steps(), steps as usize).unwrap();
+            let mut replay = Replay::new(&layout, scenario.steps(), steps as usize, false).unwrap();
             assert_eq!(replay.fill(&mut *storage::open(&path).unwrap()).unwrap(), episodes);
         });
         line("read episodes", Some(raw), &|| {

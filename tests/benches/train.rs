@@ -35,6 +35,8 @@ struct Bench {
     dumie: Option<Dumie>,
     replay: Replay,
     batch: Batch,
+    /// What encoders make of the minibatch.
+    sent: Vec<f32>,
     bonus: Vec<f32>,
     update: u64,
 }
@@ -63,8 +65,7 @@ impl Bench {
         let recording = Recording { scenario: &*scenario, link: &*link, policy: &*policy, seed: 1, episodes: 400 };
         let episodes: Vec<Episode> = (0..400).map(|index| recording.episode(index)).collect();
         let layout = recording.layout();
-        let mut replay = Replay::new(&layout, scenario.steps(), 100_000).unwrap();
-        replay.encoded = learner.actors.encodes();
+        let mut replay = Replay::new(&layout, scenario.steps(), 100_000, learner.actors.encodes()).unwrap();
         let mut dumie = dumie.map(|config| Dumie::new(&layout, config, [0.01, 0.01], &seeds).unwrap());
         for episode in &episodes {
             replay.push(episode, &[]).unwrap();
@@ -72,7 +73,8 @@ impl Bench {
                 dumie.observe(episode);
             }
         }
-        Self { learner, dumie, replay, batch: Batch::default(), bonus: Vec::new(), update: 0 }
+        let [sent, bonus] = [Vec::new(), Vec::new()];
+        Self { learner, dumie, replay, batch: Batch::default(), sent, bonus, update: 0 }
     }
 
     /// One update; adds what each part took.
@@ -87,11 +89,14 @@ impl Bench {
         lap(&mut parts[0]);
         self.bonus.clear();
         if let Some(dumie) = &mut self.dumie {
-            let encoder = self.learner.actors.encodes().then_some(&mut self.learner);
-            dumie.train(&self.replay, encoder, &mut rng, None).unwrap();
+            let mut senders = self.learner.senders();
+            dumie.train(&self.replay, senders.as_mut(), &mut rng, None).unwrap();
             lap(&mut parts[1]);
-            self.learner.encode_batch(&mut self.batch);
-            dumie.bonus(&self.batch, &mut rng, &mut self.bonus);
+            let messages = senders.map_or(&self.batch.observations, |mut senders| {
+                senders.encode(&self.batch.observations, BATCH, &mut self.sent);
+                &self.sent
+            });
+            dumie.bonus(&self.batch, messages, &mut rng, &mut self.bonus);
             lap(&mut parts[2]);
         }
         assert!(self.learner.update(&self.batch, &self.bonus).unwrap().is_finite());

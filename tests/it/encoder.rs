@@ -105,8 +105,12 @@ fn a_warm_start_gives_the_next_critic_loss_and_the_rings_of_the_live_run() {
         live.resume().unwrap();
         // the run's networks before a fresh memory: what the store says was sent is not needed for the loss
         warm.warm_start(ccmarl::storage::open(&store).unwrap().as_mut()).unwrap();
-        assert_eq!(warm.rings(), live.rings(), "rings hold what was sent at rollout, in both");
         assert_eq!(warm.rings().is_some(), algorithm == "cc-maddpg");
+        if let (Some(warm), Some(live)) = (warm.rings(), live.rings()) {
+            for (warm, live) in warm.iter().zip(live) {
+                assert!((warm.pushed, &warm.actions) == (live.pushed, &live.actions) && warm.messages != live.messages);
+            }
+        }
         let (from, to) = (&live.learner.params, &warm.learner.params);
         for (from, to) in [
             (&from.actors, &to.actors),
@@ -123,9 +127,18 @@ fn a_warm_start_gives_the_next_critic_loss_and_the_rings_of_the_live_run() {
         });
         let [a, b] = &mut batches;
         assert_eq!((&a.observations, &a.link, &a.actions), (&b.observations, &b.link, &b.actions));
-        live.learner.encode_batch(a);
-        warm.learner.encode_batch(b);
-        assert!(a.messages.len() == 64 * 12 && a.messages == b.messages, "messages are computed anew");
+        // the store's messages are of encoders that had learned less
+        let mut sent = Vec::new();
+        warm.learner.senders().unwrap().encode(&b.observations, 64, &mut sent);
+        let (actors, params) = (&live.learner.actors, live.learner.params.actors.read().to_vec());
+        let mut tape = Tape::default();
+        for (seen, sent) in a.observations.chunks_exact(54).zip(sent.chunks_exact(12)) {
+            for j in 0..3 {
+                let encoder = &actors.encoders[j];
+                let exact = encoder.forward(&params[actors.encoder_range(j)], &seen[18 * j..], 1, &mut tape);
+                assert!(exact.iter().zip(&sent[4 * j..]).all(|(a, b)| (a - b).abs() < 1e-6), "sender {j}");
+            }
+        }
         let found = live.next_critic_loss().unwrap();
         assert_eq!(Some(found.to_bits()), report.next_critic_loss.map(f64::to_bits));
         assert_eq!(live.learner.td_loss(a).to_bits(), warm.learner.td_loss(b).to_bits());
@@ -133,14 +146,60 @@ fn a_warm_start_gives_the_next_critic_loss_and_the_rings_of_the_live_run() {
 }
 
 #[test]
-fn a_store_whose_messages_are_not_the_encoders_is_refused_with_the_difference() {
+fn a_warm_start_sends_anew_what_a_store_of_any_messages_observed() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut wide = encoded("cc-maddpg", 1000);
+    wide.maddpg.message_width = Some(18);
+    // no update before step 1024: the encoders of the rollouts are those that the run starts with
+    for (name, recorded, same) in [
+        ("own", encoded("cc-maddpg", 1000), true),
+        ("observed", config("cc-maddpg", 1000), false),
+        ("wide", wide, false),
+    ] {
+        let [path, store] = ["run", "store"].map(|part| dir.path().join(name).join(part));
+        run(recorded, &path, &Options { record: Some(&store), ..Options::default() });
+        let rings = |config: TrainConfig| {
+            let mut trainer = Trainer::new(config.resolve().unwrap(), Path::new("unused")).unwrap();
+            trainer.warm_start(ccmarl::storage::open(&store).unwrap().as_mut()).unwrap();
+            trainer
+        };
+        let mut warm = rings(encoded("cc-maddpg", 1000));
+        if same {
+            let mut rolled = Trainer::new(encoded("cc-maddpg", 1000).resolve().unwrap(), Path::new("unused")).unwrap();
+            while rolled.step() < 1000 {
+                rolled.advance(None).unwrap();
+            }
+            assert_eq!(warm.rings(), rolled.rings());
+        }
+        // the newest pairs of both rings are of the last episodes; each message is some sender's of some step
+        let mut senders = warm.learner.senders().unwrap();
+        let made: Vec<Vec<f32>> = episodes(&store)
+            .iter()
+            .flat_map(|e| {
+                (0..3).map(|j| senders.encode_of(j, &e.observations[j].data, 26).to_vec()).collect::<Vec<_>>()
+            })
+            .flat_map(|rows| rows.chunks_exact(4).map(<[f32]>::to_vec).collect::<Vec<_>>())
+            .collect();
+        for ring in warm.rings().unwrap() {
+            let pairs: Vec<&[f32]> = ring.messages.chunks_exact(4).collect();
+            assert!(ring.widths[0] == 4 && pairs.len() > 200, "{name}");
+            assert!(pairs.iter().step_by(40).all(|pair| made.iter().any(|made| made == pair)), "{name}");
+        }
+    }
+    // an unshaped run has no rings, and takes the store all the same
+    let store = dir.path().join("observed/store");
+    run(encoded("maddpg", 500), &dir.path().join("b"), &Options { warm_start: Some(&store), ..Options::default() });
+}
+
+#[test]
+fn a_store_of_an_encoders_messages_is_refused_where_a_message_is_the_observation() {
     let dir = tempfile::tempdir().unwrap();
     let store = |name: &str, config: TrainConfig| {
         let store = dir.path().join(format!("store-{name}"));
         run(config, &dir.path().join(name), &Options { record: Some(&store), ..Options::default() });
         store
     };
-    let [observed, narrow] = [store("observed", config("maddpg", 500)), store("narrow", encoded("maddpg", 500))];
+    let narrow = store("narrow", encoded("maddpg", 500));
     let refused = |config: TrainConfig, store: &Path| {
         let options = Options { warm_start: Some(store), ..Options::default() };
         let out = dir.path().join("out");
@@ -148,17 +207,9 @@ fn a_store_whose_messages_are_not_the_encoders_is_refused_with_the_difference() 
         assert!(!out.exists());
         error.to_string()
     };
-    let here = |here: usize, there: usize| {
-        let agent = |message| format!("agent_0 (observation 18, message {message}, action 2)");
-        format!("cannot train on this: agent 0 is {} here and {} in the store", agent(here), agent(there))
-    };
-    let mut wide = encoded("cc-maddpg", 500);
-    wide.maddpg.message_width = Some(9);
-    assert_eq!(refused(wide, &narrow), here(9, 4));
-    assert_eq!(refused(encoded("maddpg", 500), &observed), here(4, 18));
-    assert_eq!(refused(config("maddpg", 500), &narrow), here(18, 4));
-    let options = Options { warm_start: Some(&narrow), ..Options::default() };
-    run(encoded("maddpg", 500), &dir.path().join("fits"), &options);
+    let agent = |message| format!("agent_0 (observation 18, message {message}, action 2)");
+    let expected = format!("cannot train on this: agent 0 is {} here and {} in the store", agent(18), agent(4));
+    assert_eq!(refused(config("maddpg", 500), &narrow), expected);
     // messages as wide as observations, but an encoder's
     let mut alike = encoded("maddpg", 500);
     alike.maddpg.message_width = Some(18);
@@ -215,6 +266,9 @@ fn what_cannot_be_is_refused_and_what_is_left_out_is_filled_in() {
     assert_eq!(range, "maddpg.message_width: expected 1 to 4096, found 0");
     let layers = refused(|c| c.maddpg.encoder_hidden = Some(vec![8, 0]));
     assert_eq!(layers, "maddpg.encoder_hidden: expected at most 16 layers of 1 to 4096 units, found [8, 0]");
+    let many = refused(|c| c.maddpg.encoder_hidden = Some(vec![4096; 16]));
+    let found = "found 755467859: make layers narrower";
+    assert_eq!(many, format!("maddpg.hidden: expected at most 268435456 parameters in all networks, {found}"));
     let alone = refused(|c| c.scenario = Spec::new("simple_spread").with("agents", 1));
     assert_eq!(alone, "maddpg.messages: an encoder learns through who hears it, found 1 learner: set \"observation\"");
     let mut plain = config("cc-maddpg", 500);

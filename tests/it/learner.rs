@@ -19,8 +19,7 @@ fn replay(learner: &Maddpg, dumie: &mut Dumie) -> Replay {
     let params = learner.params.actors.read();
     let policy = Trained::new(learner.actors.clone(), &params, ActionNoise::Gaussian(1.0), serde_json::Map::new());
     let recording = Recording { scenario: &*scenario, link: &*link, policy: &policy, seed: 1, episodes: 60 };
-    let mut replay = Replay::new(&scenario.layout(), scenario.steps(), 10_000).unwrap();
-    replay.encoded = learner.actors.encodes();
+    let mut replay = Replay::new(&scenario.layout(), scenario.steps(), 10_000, learner.actors.encodes()).unwrap();
     for index in 0..60 {
         let episode = recording.episode(index);
         replay.push(&episode, &[]).unwrap();
@@ -58,19 +57,22 @@ fn an_update_allocates_nothing_of_its_own_once_it_is_warm() {
         let rows = if estimators.negatives == Negatives::All { 100 } else { 1024 };
         let seeds = Seeds::new(1);
         let mut learner = Maddpg::new(&learners, Activation::Tanh, config, &seeds).unwrap();
-        let encodes = learner.actors.encodes();
         let mut layout = layout.clone();
         layout.agents.iter_mut().zip(&learner.actors.message).for_each(|(agent, width)| agent.message = *width);
         let mut dumie = Dumie::new(&layout, estimators, [0.01, 0.01], &seeds).unwrap();
         let replay = replay(&learner, &mut dumie);
-        let (mut batch, mut bonus) = (Batch::default(), Vec::new());
+        let (mut batch, mut sent, mut bonus) = (Batch::default(), Vec::new(), Vec::new());
         let mut update = |index: u64| {
             let mut rng = seeds.indexed_stream("update", index);
             replay.sample(&mut rng, rows, &mut batch);
             replay.redraw_links(&mut rng, &mut batch);
-            let metrics = dumie.train(&replay, encodes.then_some(&mut learner), &mut rng, None).unwrap();
-            learner.encode_batch(&mut batch);
-            dumie.bonus(&batch, &mut rng, &mut bonus);
+            let mut senders = learner.senders();
+            let metrics = dumie.train(&replay, senders.as_mut(), &mut rng, None).unwrap();
+            let messages = senders.map_or(&batch.observations, |mut senders| {
+                senders.encode(&batch.observations, rows, &mut sent);
+                &sent
+            });
+            dumie.bonus(&batch, messages, &mut rng, &mut bonus);
             assert!(metrics.jsd.is_some() && metrics.club.is_some() && bonus.iter().any(|&b| b != 0.0));
             learner.update(&batch, &bonus).unwrap();
         };

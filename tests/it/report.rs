@@ -258,6 +258,68 @@ fn runs_that_differ_in_a_setting_are_two_rows_with_the_setting_in_their_names() 
     assert!(published(0) && !published(1), "the paper has no cc-maddpg trained at dropout 0.5");
 }
 
+#[test]
+fn a_learner_that_is_not_the_papers_is_named_beside_published_values() {
+    let dir = tempfile::tempdir().unwrap();
+    for (name, prior, maddpg) in [
+        ("plain", "name = \"dropout\"\np = 0.2", "batch = 1024\ngamma = 0.95\nmessages = \"observation\"\ntau = 0.01"),
+        ("ours", "name = \"dropout\"\np = 0.2", "gamma = 0.9\nmessages = \"encoder\"\nmessage_width = 8"),
+        ("apart", "name = \"dropout\"\np = 0.4", "gamma = 0.8"),
+    ] {
+        let path = dir.path().join(name);
+        make_run(&path, "cc-maddpg", prior, 1, -100.0);
+        let text = read(path.join("config.toml"));
+        io_write(&path.join("config.toml"), &format!("{text}\n[maddpg]\n{maddpg}\n"));
+    }
+    let summary = report(&[dir.path().to_owned()], &[], &dir.path().join("r")).unwrap();
+    let named: Vec<&String> = summary.tables[0].notes.iter().filter(|note| note.contains("default learner")).collect();
+    assert_eq!(named.len(), 1, "{named:?}");
+    let told = ": trained with maddpg.gamma = 0.9, maddpg.message_width = 8, maddpg.messages = \"encoder\"; the published row \
+                is of the default learner.";
+    assert!(named[0].starts_with("cc-maddpg (maddpg.") && named[0].ends_with(told), "{named:?}");
+}
+
+#[test]
+fn rows_of_different_links_are_not_compared_in_the_column_of_their_own_link() {
+    let dir = tempfile::tempdir().unwrap();
+    let standard = |path: &Path, loss: f64| {
+        let frame = ParquetReader::new(std::fs::File::open(path.join("evaluation.parquet")).unwrap()).finish().unwrap();
+        let n = frame.height();
+        let channels: Vec<&str> = (0..n).map(|row| if row < 4 { "prior" } else { "unrestricted" }).collect();
+        let mut columns = with(&frame, &Column::new("channel".into(), channels));
+        columns = with(&DataFrame::new(n, columns).unwrap(), &Column::new("loss_rate".into(), vec![loss; n]));
+        columns.push(Column::new("best".into(), vec![true; n]));
+        parquet(&path.join("evaluation_standard.parquet"), columns);
+    };
+    for (tables, other, differ) in
+        [("mixed", "name = \"perfect\"", true), ("same", "name = \"dropout\"\np = 0.2", false)]
+    {
+        for seed in 1..=3 {
+            for (name, algorithm, prior, loss) in
+                [("a", "cc-maddpg", "name = \"dropout\"\np = 0.2", 0.2), ("b", "fc-maddpg", other, 0.0)]
+            {
+                let path = dir.path().join(tables).join(format!("{name}{seed}"));
+                make_run(&path, algorithm, prior, seed, -100.0);
+                standard(&path, loss);
+            }
+        }
+        let out = dir.path().join(format!("report-{tables}"));
+        report(&[dir.path().join(tables)], &[], &out).unwrap();
+        let text = read(out.join("tables/simple_spread-3-paper-best-returns.md"));
+        let cells = |name: &str| -> Vec<String> {
+            let line = text.lines().find(|l| l.starts_with(&format!("| {name}"))).unwrap();
+            line.split(" | ").map(str::to_owned).collect()
+        };
+        assert_eq!(cells("algorithm")[3..], ["unrestricted", "prior |"], "{text}");
+        let [ours, losses] = [cells("cc-maddpg"), cells("messages lost")];
+        assert!(ours[3].contains("**") && ours[4].contains("**") != differ, "{text}");
+        assert_eq!((&*losses[3], &*losses[4]), ("10.0 %", if differ { "by row |" } else { "10.0 % |" }), "{text}");
+        let note = "- Channel prior is another link in each row (fc-maddpg: perfect; cc-maddpg: dropout:0.2): its column is no \
+                    comparison, nothing in it is in bold.";
+        assert_eq!(text.contains(note), differ, "{text}");
+    }
+}
+
 /// Estimates as `estimate-mi` writes them, for two agents.
 fn estimates(path: &Path) {
     let text = |name: &str, values: [&str; 4]| Column::new(name.into(), values.to_vec());

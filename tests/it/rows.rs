@@ -112,7 +112,7 @@ fn a_memory_filled_from_rows_is_the_one_that_episodes_fill() {
         let path = directory.path().join(form);
         write(&path, &layout, &episodes, false).unwrap();
         for capacity in [25 * 3, 25 * 641 + 7, 25 * 5000] {
-            let [mut pushed, mut filled] = [(); 2].map(|()| Replay::new(&layout, 25, capacity).unwrap());
+            let [mut pushed, mut filled] = [(); 2].map(|()| Replay::new(&layout, 25, capacity, false).unwrap());
             for e in &episodes {
                 pushed.push(e, &[]).unwrap();
             }
@@ -151,7 +151,7 @@ fn episodes_that_cannot_train_are_refused_by_name_from_rows_too() {
             let directory = tempfile::tempdir().unwrap();
             let path = directory.path().join(form);
             write(&path, &layout, &episodes, false).unwrap();
-            let mut replay = Replay::new(&layout, 4, 100).unwrap();
+            let mut replay = Replay::new(&layout, 4, 100, false).unwrap();
             let error = replay.fill(&mut *storage::open(&path).unwrap()).unwrap_err().to_string();
             assert!(error.contains(expected), "{form}: {error}");
         }

@@ -370,6 +370,7 @@ fn a_store_of_the_runs_own_rollouts_gives_the_next_critic_loss_of_the_replay_in_
             &ccmarl::scenario::build(&Spec::new("simple_spread")).unwrap().layout(),
             25,
             100_000,
+            false,
         )
         .unwrap();
         let episodes = warm.warm_start(ccmarl::storage::open(&store).unwrap().as_mut()).unwrap();
@@ -516,7 +517,8 @@ fn configurations_are_refused_with_their_line_or_their_name() {
     let file = dir.path().join("run.toml");
     let read = |text: &str| {
         ccmarl::io::write_atomic(&file, text.as_bytes()).unwrap();
-        TrainConfig::read(&file, Given::default()).and_then(TrainConfig::resolve).map(|_| ()).map_err(|e| e.to_string())
+        let resolved = |read: TrainConfig| read.check_plugins(&file, &read).and_then(|()| read.resolve());
+        TrainConfig::read(&file, Given::default()).and_then(resolved).map(|_| ()).map_err(|e| e.to_string())
     };
     let start = "algorithm = \"maddpg\"\nscenario = { name = \"simple_spread\" }\n";
     assert_eq!(read(start), Ok(()));

@@ -7,6 +7,7 @@ use ccmarl::algo::Masks;
 use ccmarl::io::write_atomic;
 use ccmarl::registry::Spec;
 use ccmarl::train::{EvaluationConfig, METRIC_COLUMNS, Options, Protocol, TrainConfig, Trainer, train};
+use sha2::{Digest as _, Sha256};
 
 use super::train::{LEARNED, bytes, config, frame, ints, run};
 
@@ -209,6 +210,7 @@ fn a_file_may_leave_out_what_a_flag_says_and_a_typo_in_it_is_shown_below_the_mes
     let part = "# of any algorithm\nseed = 4\n[maddpg]\ngamma = 0.9\n";
     let (code, err) = train(part, &[]);
     assert!(code == Some(2) && err.contains("missing field `algorithm`"), "{err}");
+    assert_eq!(err.lines().count(), 1, "a line that is sound is not shown: {err}");
     let (code, err) = train(part, &["--algorithm", "maddpg"]);
     assert!(code == Some(2) && err.contains("missing field `scenario`"), "{err}");
     let (code, err) = train(part, &["--algorithm", "maddpg", "--scenario", "simple_spread:2"]);
@@ -238,6 +240,77 @@ fn a_file_may_leave_out_what_a_flag_says_and_a_typo_in_it_is_shown_below_the_mes
     }
     let (_, err) = train("algorithm = \"maddpg\"\nscenario = \"\u{1b}[2J\nseed = 1\n", &[]);
     assert!(err.contains("line 2, column") && !err.contains('\u{1b}') && err.contains("\\u{1b}[2J"), "{err:?}");
+    // the mark stands below its place behind a tab
+    let (_, err) = train(&format!("{whole}maddpg =\t{{ gama = 1 }}\n"), &[]);
+    let lines: Vec<&str> = err.lines().collect();
+    assert_eq!(lines[1..], ["  3 | maddpg = { gama = 1 }", "    |            ^"], "{err}");
+    // an editor's mark before a file that leaves something out
+    let (code, err) = train(&format!("\u{feff}{part}"), &["--algorithm", "maddpg", "--scenario", "simple_spread:2"]);
+    assert_eq!(code, Some(0), "{err}");
+}
+
+#[test]
+fn what_a_file_names_is_built_for_the_scenario_that_the_flags_leave() {
+    let dir = tempfile::tempdir().unwrap();
+    let [trace, file, out] =
+        ["two.csv", "part.toml", "run"].map(|name| dir.path().join(name).to_str().unwrap().to_owned());
+    let rows: Vec<String> = (0..5 * 26).map(|at| format!("{0},{1},0,1,1\n{0},{1},1,0,1\n", at / 26, at % 26)).collect();
+    write_atomic(Path::new(&trace), format!("episode,step,sender,receiver,delivered\n{}", rows.concat()).as_bytes())
+        .unwrap();
+    let text = format!("# of two\nprior = {{ name = \"trace\", path = \"{trace}\" }}\n");
+    let train = |text: &str, flags: &[&str]| {
+        write_atomic(Path::new(&file), text.as_bytes()).unwrap();
+        ccmarl(&[&["train", "--config", &file, "--steps", "100", "--out", &out, "--force"], flags].concat())
+    };
+    let spread = "scenario = { name = \"simple_spread\" }\n";
+    for (text, flags) in [
+        (text.clone(), &["--algorithm", "maddpg", "--scenario", "simple_spread:2"][..]),
+        (format!("{text}{spread}"), &["--algorithm", "maddpg", "--agents", "2"][..]),
+    ] {
+        let (code, err) = train(&text, flags);
+        assert_eq!(code, Some(0), "{err}");
+    }
+    // refused for three, with the line of the file that says so; a flag's value has none
+    let (code, err) = train(&text, &["--algorithm", "maddpg", "--scenario", "simple_spread:3"]);
+    assert!(code != Some(0) && err.contains("configuration: line 2: "), "{err}");
+    let (code, err) = train(&format!("algorithm = \"maddpg\"\n{spread}"), &["--prior", "dropout:2"]);
+    assert!(code == Some(2) && err.starts_with("error: dropout: p must be in [0, 1]"), "{err}");
+}
+
+#[test]
+fn a_checkpoint_of_another_version_says_so() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("run");
+    run(config("maddpg", 200), &path, &Options::default());
+    let state = path.join("checkpoint/state.safetensors");
+    let bytes = std::fs::read(&state).unwrap();
+    let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
+    let (_, head) = safetensors::SafeTensors::read_metadata(&bytes).unwrap();
+    let json = head.metadata().clone().unwrap()["ccmarl.state"][64..].to_owned();
+    for (layout, found) in [(None, "none"), (Some(9_u64.to_le_bytes()), "9")] {
+        let mut arrays: std::collections::BTreeMap<String, _> = file.tensors().into_iter().collect();
+        arrays.remove("layout");
+        if let Some(layout) = &layout {
+            let view = safetensors::tensor::TensorView::new(safetensors::Dtype::U64, vec![1], layout).unwrap();
+            arrays.insert("layout".to_owned(), view);
+        }
+        // the digest is over all of it, as the program computes it
+        let mut hash = Sha256::new();
+        for (name, array) in &arrays {
+            hash.update(format!("{name}\n{:?}\n{}\n", array.dtype(), array.data().len()));
+            hash.update(array.data());
+        }
+        hash.update(&json);
+        let line = format!("{}{json}", ccmarl::schema::hex(&hash.finalize()));
+        let meta = Some([("ccmarl.state".to_owned(), line)].into_iter().collect());
+        write_atomic(&state, &safetensors::serialize(&arrays, meta).unwrap()).unwrap();
+        let error = refused(config("maddpg", 200), &path, &Options { resume: true, ..Options::default() });
+        let expected = format!(
+            "cannot resume: the checkpoint was written by another version of the program (expected layout 1, found {found}): go \
+             on with that version, or start a new run: "
+        );
+        assert!(error.starts_with(&expected), "{error}");
+    }
 }
 
 #[test]
