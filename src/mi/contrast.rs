@@ -101,6 +101,8 @@ pub(super) struct Reader {
     /// Contributions of the test rows, whose mean is the value.
     pub(super) values: Vec<f64>,
     pub(super) of: Interval,
+    /// How much more it scores on episodes that it was trained on, at least 0.
+    pub(super) gap: f64,
     pub(super) warnings: Vec<String>,
 }
 
@@ -147,7 +149,8 @@ impl Contrast {
         let of = block_interval(&values, &data.test_blocks);
         let mut warnings = self.warnings(&held, trained_on, of);
         warnings.extend((steps == 0).then(|| nothing_learnt("the critic")));
-        of.mean.is_finite().then_some(Reader { scorer, params, learnt: steps > 0, values, of, warnings })
+        let gap = (trained_on - of.mean).max(0.0);
+        of.mean.is_finite().then_some(Reader { scorer, params, learnt: steps > 0, values, of, gap, warnings })
     }
 
     /// The row.

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::contrast::{Contrast, Reader, diverged};
-use super::given::{NO_NULL, cells, permuted_within};
+use super::given::{NO_NULL, cells, permuted_within, too_wide};
 use super::knn::Points;
 use super::prepare::{Prepared, gather, prepare};
 use super::{Estimate, Kind, MiError, Protocol, block_interval, p_value};
@@ -31,10 +31,25 @@ pub(super) fn row(
     let (mut with_y, mut without) = (read(&both, "y and z")?, read(&alone, "z alone")?);
     let values: Vec<f64> = with_y.values.iter().zip(&without.values).map(|(a, b)| a - b).collect();
     let of = block_interval(&values, &both.test_blocks);
-    // the difference of two lower bounds is neither bound
-    let mut row = contrast.row_of(samples, &both, of, Kind::Estimate, with_y.learnt);
-    row.warnings.append(&mut with_y.warnings);
-    if both.test_episodes.len() == both.test.len() {
+    // the difference of two lower bounds is neither bound; a critic of z that learnt nothing leaves to y what z tells
+    let learnt = with_y.learnt && without.learnt;
+    let mut row = contrast.row_of(samples, &both, of, Kind::Estimate, learnt);
+    // each critic may be short of what it can know by as much as it lost between training and held-out episodes; and no
+    // information is under 0, whatever two critics say
+    row.interval_low = row.interval_low.map(|low| low - without.gap);
+    row.interval_high = row.interval_high.map(|high| (high + with_y.gap).max(0.0));
+    if !learnt {
+        row.warnings.push("no interval: a difference of two critics, and one learnt nothing".to_owned());
+    }
+    if learnt && of.high < 0.0 {
+        row.warnings.push("below 0: the critic of z alone knows more than that of y and z, so both err".to_owned());
+    }
+    for (reader, name) in [(&with_y, "y and z"), (&without, "z alone")] {
+        row.warnings.extend(reader.warnings.iter().map(|w| format!("critic of {name}: {w}")));
+    }
+    if let Some(why) = too_wide(alone.y_width) {
+        row.warnings.push(why);
+    } else if both.test_episodes.len() == both.test.len() {
         row.p_value = null([(&mut with_y, &both), (&mut without, &alone)], protocol, seeds);
     } else {
         row.warnings.push(NO_NULL.to_owned());
@@ -103,8 +118,33 @@ mod tests {
             assert!((found.value - truth).abs() < 0.06, "{truth}: {found:?}");
             assert_eq!(found.p_value.unwrap() <= 0.01, truth > 0.0, "{truth}: {found:?}");
             assert_eq!((found.kind, found.given.as_deref()), (Kind::Estimate, Some("z")));
-            assert!(found.interval_low.unwrap() < found.value && found.value < found.interval_high.unwrap());
+            // `beside`: z alone tells nothing of x, and its critic learns nothing
+            let told = found.warnings.iter().any(|w| w.starts_with("no interval: a difference of two critics"));
+            let learnt = !found.warnings.iter().any(|w| w.starts_with("critic of z alone: the critic"));
+            assert_eq!((found.interval_low.is_some(), told), (learnt, !learnt), "{found:?}");
+            assert!(found.interval_low.is_none_or(|low| low < found.value), "{found:?}");
+            assert!(found.interval_high.is_none_or(|high| found.value < high), "{found:?}");
         }
+    }
+
+    #[test]
+    fn where_z_tells_nearly_all_the_interval_holds_nothing() {
+        let near = samples(1500, |[a, b, c]| [a + 0.03 * b, a + 0.03 * c, a]);
+        let found = estimate(&near, "infonce");
+        let (low, high) = (found.interval_low.unwrap(), found.interval_high.unwrap());
+        assert!(low <= 0.0 && 0.0 <= high, "{found:?}");
+    }
+
+    #[test]
+    fn z_that_teaches_nothing_leaves_no_interval_and_wide_z_no_p_value() {
+        let useless = samples(600, |[a, b, c]| [a, a + 0.1 * b, c]);
+        let found = estimate(&useless, "infonce");
+        assert!(found.interval_low.is_none() && found.warnings.iter().any(|w| w.starts_with("critic of z alone: ")));
+        let wide = Samples { z: Some(linear_samples(0.5, 600, 4, 7).x), ..useless };
+        let found = estimate(&wide, "infonce");
+        assert!(
+            found.p_value.is_none() && found.warnings.iter().any(|w| w.contains("in 4 columns they are not alike"))
+        );
     }
 
     #[test]

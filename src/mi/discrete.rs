@@ -20,7 +20,8 @@
 //! remains when the local terms do not vary: without dependence, and in a copy. Downwards it also reaches as far as with the bias
 //! of the pairs that independence would leave unseen, as with two samples' worth of independence mixed in (a copy without exception may
 //! have exceptions), and to 0 when the p-value is above 0.05. That of `discrete` reaches up to its own
-//! value. `discrete-mm` is held to ln of the fewer categories of x and y, and to minus that remaining error. The p-value permutes whole
+//! value. `discrete-mm` is held to ln of the fewer categories of x and y, and to minus that remaining
+//! error: without dependence, in large tables, that lifts its mean by 0.08 of the error. The p-value permutes whole
 //! episodes; given z, x within equal z, if every sample is its own episode.
 //!
 //! # When it fails
@@ -329,6 +330,7 @@ mod tests {
             // a copy of 30 different values, and of a fair coin; all pairs of 6 and 6 once; a die and its parity
             samples_of(&numbers(|i| i, 30), &numbers(|i| i, 30)),
             samples_of(&numbers(|i| i % 2, 30), &numbers(|i| i % 2, 30)),
+            samples_of(&numbers(|i| i % 2, 100), &numbers(|i| i % 2, 100)),
             samples_of(&numbers(|i| i / 6, 36), &numbers(|i| i % 6, 36)),
             samples_of(&numbers(|i| i % 6, 60), &numbers(|i| i % 2, 60)),
             samples_of(&numbers(|i| i % 5, 40), &numbers(|i| i * i % 7, 40)),

@@ -13,6 +13,8 @@ use crate::schema::{Columns, SampleLabels, Samples};
 
 /// Most different triples: beyond them columns are continuous, and counts say nothing.
 const TRIPLES: usize = 1 << 20;
+/// Rows per pair of categories, those that did not occur among them, from which the G-test is one.
+const EXPECTED: f64 = 5.0;
 /// Said on the row.
 const NOTES: &str = "all rows in one pass; interval: rows as they are, p: G-test";
 
@@ -118,9 +120,23 @@ impl OnePass for DiscretePass {
         }
         let degrees: f64 = strata.values().map(|[x, y]| x * y).sum();
         let g = 2.0 * self.rows as f64 * counted.information().max(0.0);
-        let p = ChiSquared::new(degrees).map_or(1.0, |of| of.sf(g));
-        let notes = notes.iter().cloned().chain([format!("{NOTE}{NOTES}")]).collect();
-        Ok(counted.rows(labels, local, Some(p), notes))
+        let mut notes = notes.to_vec();
+        let cells: f64 = strata.values().map(|[x, y]| (x + 1.0) * (y + 1.0)).sum();
+        let expected = self.rows as f64 / cells;
+        let p = (expected >= EXPECTED).then(|| ChiSquared::new(degrees).map_or(1.0, |of| of.sf(g)));
+        if p.is_none() {
+            notes.push(format!(
+                "no p-value: {expected:.1} rows per pair of categories, and the G-test needs {EXPECTED}; with --sample N \
+                 rows are permuted instead"
+            ));
+        }
+        notes.push(format!("{NOTE}{NOTES}"));
+        let mut rows = counted.rows(labels, local, p, notes);
+        if p.is_none() {
+            // nothing says that there is dependence at all
+            rows.iter_mut().for_each(|row| row.interval_low = row.interval_low.map(|low| low.min(0.0)));
+        }
+        Ok(rows)
     }
 }
 

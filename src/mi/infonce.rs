@@ -19,13 +19,15 @@
 //! `critic`: `separable` (the default) or `concatenated`.
 //! Training as for `jsd`: Adam 2e-3 falling to 0, weight decay 0.5, at most 600 steps of 256 pairs with 64 derangements (16 for
 //! the concatenated critic), stopped on the validation episodes. The p-value given z exchanges x within cells of at most sixteen held-out samples with
-//! neighbouring z, critics kept, if every sample is its own episode.
+//! neighbouring z, critics kept, if every sample is its own episode and z has at most three columns. The interval given z is that of
+//! the difference, each critic being allowed what it loses between training and held-out episodes, and never wholly below 0.
 //!
 //! # When it fails
 //!
 //! It never exceeds ln K; a value above 0.8 ln K is warned of. Few samples: the held-out value falls to 0. A critic that
 //! never beats T = 0 on the validation part stays T = 0: the value is 0 and has no interval, and it says so. Given z, where z
-//! tells nearly all of x or of y: the difference of two large values scatters, and either may be near its ceiling.
+//! tells nearly all of x or of y: the difference of two large values scatters, and either may be near its ceiling. A critic of z
+//! alone that learned nothing leaves to y what z tells: then there is no interval.
 //!
 //! # Reference
 //!

@@ -17,7 +17,9 @@
 //!
 //! `k` ≥ 1, 3 by default: more lowers the variance and raises the bias. The interval is by subsampling whole episodes (at
 //! most 20,000 samples; 6,000 above four columns), reaching farther where the value still drifts as samples are added; the p-value permutes them (at most 4,000; 1,500). Given z, x is permuted
-//! within cells of at most sixteen samples with neighbouring z, if every sample is its own episode.
+//! within cells of at most sixteen samples with neighbouring z, if every sample is its own episode; beyond three columns of z
+//! there is neither p-value nor interval, since neighbours in so many still differ in z. With a p-value above 0.05 the interval
+//! reaches down to 0.
 //!
 //! # When it fails
 //!

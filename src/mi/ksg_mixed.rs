@@ -22,7 +22,8 @@
 //!
 //! In many columns, as `ksg1`. Numbers that code three or more categories get distances that mean nothing: leave them as
 //! words, which are far from each other, so that neighbours share them; a word of k or fewer samples borrows neighbours
-//! from the next in the alphabet. For discrete columns alone, `discrete` is exact.
+//! from the next in the alphabet. With fewer than about 4k samples per value of a discrete side it is too high, without
+//! dependence too (0.2 nats in 60 samples of seven values), and says so. For discrete columns alone, `discrete` is exact.
 //!
 //! # Reference
 //!

@@ -1,15 +1,18 @@
 //! What the nearest-neighbour estimators share: their row, its interval and its p-value, whatever the terms that they
 //! average.
 
+use std::collections::BTreeSet;
+
 use serde::{Deserialize, Serialize};
 use statrs::function::gamma::digamma;
 
+use super::counts::Categories;
 use super::gaussian::{copy, determined};
-use super::given::{NO_NULL, cells};
+use super::given::{NO_NULL, cells, too_wide};
 use super::interval::{block_interval, t_quantile};
 use super::knn::{Points, within};
 use super::part::Part;
-use super::prepare::{points, tied};
+use super::prepare::{all_tied, points, tied};
 use super::{Estimate, Kind, MiError, Protocol, Unit, p_value};
 use crate::registry::{RegistryError, Spec};
 use crate::rng::Seeds;
@@ -24,6 +27,12 @@ const SAME_SHARE: f64 = 1e-9;
 /// The variance times the number m of samples grows as m/(m + 9 k): measured on normals without dependence, k = 3, as 0.34
 /// at m = 50, 0.43 at 100, 0.48 at 250, 0.51 at 500; it grows less with dependence.
 const GROWTH: f64 = 9.0;
+
+/// Samples per value of a discrete side, in k, under which the value is said to be too high.
+const PER_VALUE: usize = 4;
+
+/// Most values of a side of numbers that counts as discrete; more are steps of a continuous scale.
+const NUMBERS: usize = 20;
 
 /// Joint columns above which the estimate is said to be too low.
 const WIDE: usize = 8;
@@ -98,9 +107,10 @@ impl Neighbours {
         out.n_effective = block_interval(&local, &samples.episodes()).n_effective;
         let statistic = |from: &[u32], rows: &[u32]| mean(&terms(from, rows));
         let limits = Limits::of(width);
+        let wide_z = z.as_ref().and_then(|z| too_wide(z.width));
         let part = Part::drawn(samples, limits.interval, &seeds.child("interval"));
         let subsampled = part.subsampled_error(n, 4 * (self.k + 1), seeds, &|rows| statistic(rows, rows));
-        if let Some(of) = subsampled {
+        if let Some(of) = subsampled.filter(|_| wide_z.is_none()) {
             // what more samples would still change is an error too, of known sign: in more than two columns no small one
             let (half, drift) =
                 (of.error_on(n, GROWTH * self.k as f64) * t_quantile(of.degrees + 1), of.drift(value, n));
@@ -108,7 +118,12 @@ impl Neighbours {
                 (Some(value - half + drift.min(0.0)), Some(value + half + drift.max(0.0)));
         }
         let part = Part::drawn(samples, limits.null, &seeds.child("null"));
-        if protocol.permutations > 0 {
+        if let Some(why) = wide_z {
+            warnings.push(why);
+            warnings.push(
+                "no interval: among neighbours in so many columns of z, z still tells of both x and y".to_owned(),
+            );
+        } else if protocol.permutations > 0 {
             let under_null = |from: &[u32]| statistic(from, &part.rows);
             let null = match &z {
                 None => Some(part.null(samples, protocol, seeds, &under_null)),
@@ -118,6 +133,12 @@ impl Neighbours {
                 Some(null) => out.p_value = p_value(under_null(&part.rows), &null),
                 None => warnings.push(NO_NULL.to_owned()),
             }
+        }
+        if out.p_value.is_some_and(|p| p > 0.05) {
+            out.interval_low = out.interval_low.map(|low| low.min(0.0));
+        }
+        for (columns, label) in [(&samples.x, &labels.x), (&samples.y, &labels.y)] {
+            warnings.extend(self.few_per_value(columns, &samples.rows, label).filter(|_| self.for_ties));
         }
         if all.len() < 20 {
             warnings.push(format!("few blocks: the interval rests on {} episodes", all.len()));
@@ -140,6 +161,25 @@ impl Neighbours {
         }
         out.warnings = warnings;
         Ok(out)
+    }
+}
+
+impl Neighbours {
+    /// Says when a discrete side has few samples per value: neighbours then come from other values.
+    fn few_per_value(&self, columns: &Columns, rows: &[u32], label: &str) -> Option<String> {
+        let words = (0..columns.width()).all(|c| columns.is_words(c));
+        if !words && !all_tied(columns, rows) {
+            return None;
+        }
+        let of = Categories::new(columns).of;
+        let values: BTreeSet<u32> = rows.iter().map(|&r| of[r as usize]).collect();
+        if !words && values.len() > NUMBERS {
+            return None;
+        }
+        (rows.len() < PER_VALUE * self.k * values.len()).then(|| {
+            let each = (rows.len() as f64 / values.len() as f64).round();
+            format!("about {each} samples per value of {label}, k = {}: the value is too high", self.k)
+        })
     }
 }
 
@@ -367,6 +407,51 @@ pub(super) mod tests {
         samples.starts = (0..=150).map(|e| 10 * e).collect::<Vec<_>>().into();
         let trajectories = row("ksg1", &samples, 39);
         assert_eq!((trajectories.p_value, trajectories.warnings), (None, vec![NO_NULL.to_owned()]));
+    }
+
+    #[test]
+    fn wide_z_leaves_no_p_value_and_no_interval() {
+        let noise = linear_samples(0.0, 300, 8, 3);
+        let column = |c: usize| -> Vec<Vec<f64>> {
+            (0..300).map(|r| vec![noise.x.row(r)[0] + 0.4 * noise.y.row(r)[c]]).collect()
+        };
+        for width in [3, 4, 8] {
+            let z: Vec<Vec<f64>> = (0..300).map(|r| noise.x.row(r)[..width].to_vec()).collect();
+            let mut samples = samples_of(&column(0), &column(1));
+            samples.z = Some(samples_of(&z, &z).x);
+            for name in ["ksg1", "ksg-mixed"] {
+                let found = row(name, &samples, 39);
+                let told = |start: &str| found.warnings.iter().any(|w| w.starts_with(start));
+                assert_eq!(
+                    (found.p_value.is_some(), found.interval_low.is_some()),
+                    (width == 3, width == 3),
+                    "{found:?}"
+                );
+                assert_eq!((told("no p-value"), told("no interval")), (width > 3, width > 3), "{found:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn noise_beside_words_of_few_samples_is_said_to_be_too_high_and_may_be_nothing() {
+        for (words, few) in [(28, true), (7, true), (3, false)] {
+            let mut above = 0;
+            for seed in 0..10 {
+                let mut rng = Seeds::new(seed).stream("words");
+                let x: Vec<Vec<f64>> = (0..60).map(|_| vec![rng::normal(&mut rng)]).collect();
+                let y: Vec<Vec<f64>> = (0..60).map(|_| vec![rng::below(&mut rng, words) as f64]).collect();
+                let mut samples = samples_of(&x, &y);
+                samples.y = std::sync::Arc::new(Columns { words: vec![true], ..(*samples.y).clone() });
+                let found = row("ksg-mixed", &samples, 99);
+                let told =
+                    found.warnings.iter().any(|w| w.contains("samples per value of y, k = 3: the value is too high"));
+                assert_eq!(told, few, "{words}: {:?}", found.warnings);
+                above += usize::from(found.interval_low.is_some_and(|low| low > 0.0));
+                assert!(found.p_value.unwrap() <= 0.05 || found.interval_low.is_none_or(|low| low <= 0.0), "{found:?}");
+            }
+            // as many as p-values are small
+            assert!(above <= 3, "{words}: {above} of 10 intervals above 0");
+        }
     }
 
     #[test]

@@ -139,6 +139,27 @@ mod tests {
     }
 
     #[test]
+    fn a_sparse_table_has_no_p_value_and_its_interval_reaches_to_nothing() {
+        // about two rows per cell, then six
+        for (levels, per_cell) in [(60, 2.2), (60, 4.5), (40, 6.0)] {
+            let rows = (f64::from(levels * levels) * per_cell) as usize;
+            let mut rng = Seeds::new(3).stream("sparse");
+            let mut draw = || -> Vec<Vec<f64>> {
+                (0..rows).map(|_| vec![crate::rng::below(&mut rng, levels as usize) as f64]).collect()
+            };
+            let samples = samples_of(&draw(), &draw());
+            let mut pass = plan(&["discrete"], 0, 1).estimators[0].1.one_pass().unwrap();
+            pass.add(&samples).unwrap();
+            let found = pass.finish(&samples.labels, &[]).unwrap();
+            let told = found[0].warnings.iter().any(|w| w.starts_with("no p-value") && w.contains("--sample"));
+            assert_eq!((found[0].p_value.is_none(), told), (per_cell < 5.0, per_cell < 5.0), "{found:?}");
+            // the chi-square limit is near 0.000 at two rows per cell
+            assert!(found[0].p_value.is_none_or(|p| p > 0.001), "{found:?}");
+            assert!(per_cell > 5.0 || found.iter().all(|r| r.interval_low.is_none_or(|low| low <= 0.0)), "{found:?}");
+        }
+    }
+
+    #[test]
     fn what_cannot_be_estimated_says_why_as_all_at_once_does() {
         let base = linear_samples(0.5, 400, 1, 3);
         let constant = samples_of(&vec![vec![2.5]; 400], &vec![vec![1.0]; 400]);

@@ -143,20 +143,22 @@ pub(super) fn some_of(names: &[&str]) -> String {
     if names.len() > 3 { format!("{shown} and {} more", names.len() - 3) } else { shown }
 }
 
+/// Whether most values of every column are repeated.
+pub(super) fn all_tied(columns: &Columns, rows: &[u32]) -> bool {
+    (0..columns.width()).all(|c| {
+        let mut values: Vec<f64> = rows.iter().map(|&r| columns.row(r as usize)[c]).collect();
+        values.sort_unstable_by(f64::total_cmp);
+        let alone = (0..values.len())
+            .filter(|&i| (i == 0 || values[i - 1] != values[i]) && values.get(i + 1) != Some(&values[i]));
+        alone.count() * 2 < values.len()
+    })
+}
+
 /// Says when most values of every column of x, or of y, are repeated: densities do not describe such data.
 pub(super) fn tied(samples: &Samples) -> Option<String> {
-    let all_tied = |columns: &Columns| {
-        (0..columns.width()).all(|c| {
-            let mut values: Vec<f64> = samples.rows.iter().map(|&r| columns.row(r as usize)[c]).collect();
-            values.sort_unstable_by(f64::total_cmp);
-            let alone = (0..values.len())
-                .filter(|&i| (i == 0 || values[i - 1] != values[i]) && values.get(i + 1) != Some(&values[i]));
-            alone.count() * 2 < values.len()
-        })
-    };
     let which: Vec<&str> = [(&samples.x, &samples.labels.x), (&samples.y, &samples.labels.y)]
         .into_iter()
-        .filter(|(columns, _)| all_tied(columns))
+        .filter(|(columns, _)| all_tied(columns, &samples.rows))
         .map(|(_, label)| label.as_str())
         .collect();
     (!which.is_empty()).then(|| {
