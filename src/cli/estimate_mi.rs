@@ -327,7 +327,7 @@ fn input(args: &Args, plan: Plan) -> anyhow::Result<Input> {
             options.sample = Some(pairs::Sample { rows: large::SAMPLE, seeds: sample_seeds(args) });
             let parts = args.all_pairs || args.group.is_some() || args.time.is_some() || !args.by.is_empty();
             if !parts {
-                return Ok(large::read(&paths, options, plan, args.plot.is_some())?);
+                return large::read(&paths, options, plan, args.plot.is_some(), args.threads);
             }
             let samples = of_table(args, &paths, &options)?;
             return Ok(Input { samples, plan, places: None, results: Vec::new() });
