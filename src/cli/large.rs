@@ -111,13 +111,13 @@ mod tests {
     use crate::registry::{Spec, find};
     use crate::schema::{Columns, Exchange, SampleLabels};
 
-    /// Takes so many pieces, each on a pool of two threads.
+    /// Takes so many pieces, as long as it is on a pool of two threads.
     struct Counting(usize);
 
     impl OnePass for Counting {
         fn add(&mut self, _: &Samples) -> Result<(), MiError> {
-            assert_eq!(rayon::current_num_threads(), 2);
-            self.0 = self.0.checked_sub(1).ok_or(MiError::TooFewSamples { needed: 1, widths: 2, found: 0 })?;
+            let left = self.0.checked_sub(1).filter(|_| rayon::current_num_threads() == 2);
+            self.0 = left.ok_or(MiError::TooFewSamples { needed: 1, widths: 2, found: 0 })?;
             Ok(())
         }
 

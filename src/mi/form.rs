@@ -103,7 +103,7 @@ mod tests {
         let path = dir.path().join("rows.json");
         let row = Estimate::new("gaussian", &SampleLabels::default(), 1.0, Unit::Nats, Kind::Estimate, 3);
         for (bytes, ours) in [(b"[]".to_vec(), false), (to_json(&[row]).unwrap(), true), (b"[{}]".to_vec(), false)] {
-            std::fs::write(&path, bytes).unwrap();
+            io::write_atomic(&path, &bytes).unwrap();
             assert_eq!(holds::<Estimate>(&path), ours);
         }
     }

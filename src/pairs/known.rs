@@ -180,7 +180,7 @@ mod tests {
         let path = dir.path().join("run.parquet");
         let partial = io::partial_path(&path);
         std::fs::create_dir(&partial).unwrap();
-        std::fs::write(partial.join("journal"), "a recording").unwrap();
+        io::write_atomic(&partial.join("journal"), b"a recording").unwrap();
         let known = Known { rows: 10, rho: 0.5, seed: 1 };
         assert!(!known.write(&path, &mut |_| false).unwrap());
         assert!(known.write(&path, &mut |_| true).unwrap());

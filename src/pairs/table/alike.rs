@@ -135,16 +135,13 @@ impl Seen {
         let mut out = Vec::with_capacity(texts.len());
         for text in texts.iter() {
             let next = self.words.len() as u32;
-            out.push(match text {
-                None => None,
-                Some(text) => match self.words.get(text) {
-                    Some(&number) => Some(number),
-                    None => {
-                        self.words.insert(text.to_owned(), next);
-                        Some(next)
-                    }
-                },
+            let number = text.map(|text| {
+                self.words.get(text).copied().unwrap_or_else(|| {
+                    self.words.insert(text.to_owned(), next);
+                    next
+                })
             });
+            out.push(number);
             if self.words.len() > WORDS {
                 let (name, path) = (column.name().to_string(), path.to_owned());
                 return Err(PairsError::TooManyWords { name, most: WORDS, path });

@@ -220,8 +220,8 @@ mod tests {
     fn all_pairs_have_every_column_once_where_no_value_is_missing() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("t.csv");
-        std::fs::write(&path, "a,b,c,d\n1,2,3,4\n2,3,5,\n4,4,4,8\n").unwrap();
-        let (sets, _) = all_pairs(&[path.clone()], &TableOptions::default()).unwrap();
+        crate::io::write_atomic(&path, b"a,b,c,d\n1,2,3,4\n2,3,5,\n4,4,4,8\n").unwrap();
+        let (sets, _) = all_pairs(std::slice::from_ref(&path), &TableOptions::default()).unwrap();
         let named = |x: &str, y: &str| sets.iter().find(|s| s.labels.x == x && s.labels.y == y).unwrap();
         assert_eq!(sets.len(), 6);
         assert!(Arc::ptr_eq(&named("a", "b").x, &named("a", "c").x));

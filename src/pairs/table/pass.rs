@@ -93,7 +93,7 @@ pub fn pass(
             }
             Ok(wanted || drawn.is_some())
         })?;
-        let columns = [&read.options.x, &read.options.y, &read.options.given].map(|list| list.as_slice()).concat();
+        let columns = [&read.options.x, &read.options.y, &read.options.given].map(Vec::as_slice).concat();
         let columns = columns.join(", ");
         let path = paths[0].clone();
         let Some(mut sample) = last else {
@@ -360,7 +360,7 @@ mod tests {
                 let number = if row % 3 == 0 { "1.5".to_owned() } else { row.to_string() };
                 writeln!(text, "2024-01-{day:02}T00:00:00.25,{large},{word},{late},{number}").unwrap();
             }
-            std::fs::write(path, text).unwrap();
+            crate::io::write_atomic(path, text.as_bytes()).unwrap();
         }
         (dir, paths)
     }
@@ -415,7 +415,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("t.csv");
         let text = format!("a,b\n{}{}", "1,\n".repeat(30), "2.5,x\n".repeat(30));
-        std::fs::write(&path, text).unwrap();
+        crate::io::write_atomic(&path, text.as_bytes()).unwrap();
         let options = TableOptions { sample: Some(Sample { rows: 1000, seeds: Seeds::new(1) }), ..of("a", "b", &[]) };
         let size = PieceSize { rows: 1, bytes: 20 };
         let passed = pass(&[path], &options, size, &mut |_, _| true).unwrap();
@@ -428,8 +428,8 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let paths = ["1.csv", "2.csv"].map(|name| dir.path().join(name));
         let fails = |first: &str, second: &str| {
-            std::fs::write(&paths[0], format!("a,b\n{first}")).unwrap();
-            std::fs::write(&paths[1], format!("a,b\n{second}")).unwrap();
+            crate::io::write_atomic(&paths[0], format!("a,b\n{first}").as_bytes()).unwrap();
+            crate::io::write_atomic(&paths[1], format!("a,b\n{second}").as_bytes()).unwrap();
             let size = PieceSize { rows: 1, bytes: 8 };
             let error = pass(&paths, &of("a", "b", &[]), size, &mut |_, _| true).unwrap_err().to_string();
             let sample = Some(Sample { rows: 9, seeds: Seeds::new(1) });
@@ -447,8 +447,8 @@ mod tests {
             "column \"a\" holds both dates and numbers, seen from row 3 on: a large or sampled table is read in pieces";
         assert!(found.starts_with(expected), "{found}");
         // rows are those of the file, also behind a filter
-        std::fs::write(&paths[0], "a,b\n1,1\n2,2\n").unwrap();
-        std::fs::write(&paths[1], "a,b\n1,1\n1,2\n1e200,3\n").unwrap();
+        crate::io::write_atomic(&paths[0], b"a,b\n1,1\n2,2\n").unwrap();
+        crate::io::write_atomic(&paths[1], b"a,b\n1,1\n1,2\n1e200,3\n").unwrap();
         let filter = Some(crate::pairs::Predicate::parse("b > 1").unwrap());
         let options = TableOptions { filter, ..of("a", "b", &[]) };
         let error = pass(&paths, &options, PieceSize { rows: 1, bytes: 8 }, &mut |_, _| true).unwrap_err().to_string();
@@ -508,7 +508,7 @@ mod tests {
             let error = pass(&paths, &options, size, &mut |_, _| true).unwrap_err().to_string();
             assert!(error.starts_with(message), "{error}");
         }
-        std::fs::write(&paths[0], "d,x\n").unwrap();
+        crate::io::write_atomic(&paths[0], b"d,x\n").unwrap();
         let missing = pass(&paths[..1], &of("d", "i", &[]), size, &mut |_, _| true).unwrap_err().to_string();
         assert!(missing.starts_with("no column \"i\""), "{missing}");
     }
