@@ -34,6 +34,9 @@ pub enum IoError {
     /// `--force` would replace something that this program did not make.
     #[error("refusing to replace what ccmarl did not make; remove it by hand, or give another --out: {}", .0.display())]
     Foreign(PathBuf),
+    /// The same of a picture.
+    #[error("refusing to replace what is no picture of ccmarl; remove it by hand, or give another --plot: {}", .0.display())]
+    ForeignPicture(PathBuf),
     /// `--force` would remove something that this program did not put there.
     #[error(
         "refusing to replace a directory that holds what ccmarl did not put there: {}; move it, or give another --out: {}",

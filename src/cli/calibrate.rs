@@ -134,11 +134,9 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         Format::Json => ui::print_json(&result),
         Format::Table => print(&result),
     };
-    if let Some(picture) = plot {
-        picture.draw("calibration", &figure(&result, args))?;
-        ui::say(&format!("drew {} values: {}", result.tasks.len(), picture.path().display()));
-    }
+    let drawn = plot.map_or(Ok(()), |picture| draw(&picture, &result, args));
     printed?;
+    drawn?;
     Ok(if interrupted { Outcome::Interrupted } else { Outcome::Done })
 }
 
@@ -173,6 +171,18 @@ fn drawn<S: Source + Copy + 'static>(
         ui::say(&format!("interrupted: {} of {total} draws are finished, and only these count", told.len()));
     }
     Ok((calibrated(sources, told), interrupted))
+}
+
+/// Draws the tasks, if any has a value.
+fn draw(picture: &Picture, result: &Result, args: &Args) -> anyhow::Result<()> {
+    let place = picture.path().display();
+    if result.tasks.is_empty() {
+        ui::say(&format!("note: no value of a task to draw: {place}"));
+        return Ok(());
+    }
+    picture.draw("calibration", &figure(result, args))?;
+    ui::say(&format!("drew {} values: {place}", result.tasks.len()));
+    Ok(())
 }
 
 /// The mean error per task, with one standard deviation over draws.

@@ -258,16 +258,17 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Outcome> {
         Form::Parquet => ui::print_bytes(&mi::to_parquet(&rows).map_err(anyhow::Error::msg)?),
     };
     // after the results, which a picture that cannot be drawn must not take away, and even if nobody reads them
-    if let Some((view, target)) = plot.filter(|_| !interrupted) {
+    let drawn = plot.filter(|_| !interrupted).map_or(Ok(true), |(view, target)| {
         let failed: Vec<&str> = failures.iter().map(|(job, _)| job.estimator.as_str()).collect();
-        if !plot::draw(view, &rows, &failed, (&samples, &plan), args.threads, &target)? {
-            ui::say("interrupted: all estimates are shown, and no picture was drawn");
-            return Ok(Outcome::Interrupted);
-        }
-    }
+        plot::draw(view, &rows, &failed, (&samples, &plan), args.threads, &target)
+    });
     printed?;
     for (job, error) in &failures {
         ui::say(&format!("warning: no {} for {}: {error}", job.estimator, place(&job.labels)));
+    }
+    if !drawn? {
+        ui::say("interrupted: all estimates are shown, and no picture was drawn");
+        return Ok(Outcome::Interrupted);
     }
     if interrupted {
         return Ok(Outcome::Interrupted);
@@ -327,7 +328,7 @@ fn input(args: &Args, plan: Plan) -> anyhow::Result<Input> {
             options.sample = Some(pairs::Sample { rows: large::SAMPLE, seeds: sample_seeds(args) });
             let parts = args.all_pairs || args.group.is_some() || args.time.is_some() || !args.by.is_empty();
             if !parts {
-                return Ok(large::read(&paths, options, plan, args.plot.is_some())?);
+                return large::read(&paths, options, plan, args.plot.is_some(), args.threads);
             }
             let samples = of_table(args, &paths, &options)?;
             return Ok(Input { samples, plan, places: None, results: Vec::new() });

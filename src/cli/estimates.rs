@@ -100,7 +100,7 @@ pub(super) fn print(rows: &[Estimate], samples: &[Samples]) -> anyhow::Result<()
             value,
             interval.map_or_else(String::new, |(low, high)| format!("{} … {}", decimals(low), decimals(high))),
             row.unit.name().to_owned(),
-            row.p_value.map_or_else(String::new, |p| format!("{p:.3}")),
+            row.p_value.map_or_else(String::new, mi::p_text),
             row.n.to_string(),
             format!("{:.0}", row.n_effective),
         ]);

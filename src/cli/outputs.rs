@@ -56,6 +56,18 @@ pub(super) fn table<R: mi::Row>(path: &Path, force: bool) -> Result<Write<R>, Er
     Ok(write)
 }
 
+/// The error that names the option which a picture was given with.
+fn of_plot(error: Error) -> Error {
+    match error {
+        Error::Io(IoError::Exists(path)) => {
+            let path = path.display();
+            Error::Usage(format!("output exists: give --force to replace it, or another --plot: {path}"))
+        }
+        Error::Io(IoError::Foreign(path)) => IoError::ForeignPicture(path).into(),
+        other => other,
+    }
+}
+
 /// Where a picture goes.
 pub(super) struct Picture {
     path: PathBuf,
@@ -70,7 +82,7 @@ impl Picture {
             let message = format!("--plot: expected a name that ends in .svg or .png, found {}", path.display());
             return Err(Error::Usage(message));
         }
-        check(path, force, is_picture)?;
+        check(path, force, is_picture).map_err(of_plot)?;
         Ok(Self { path: path.to_owned(), is_png: ends("png") })
     }
 

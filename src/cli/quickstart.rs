@@ -95,7 +95,7 @@ fn make(out: &Path, stop: &AtomicBool) -> anyhow::Result<Outcome> {
         let cli = Cli::try_parse_from(std::iter::once("ccmarl".to_owned()).chain(words))?;
         let outcome = match cli.command {
             // where the page lies is said below, once it is there
-            Command::Report(args) => report::make(&args).map(|_| Outcome::Done)?,
+            Command::Report(args) => report::make(&args)?.map_or(Outcome::Interrupted, |_| Outcome::Done),
             command => dispatch(command)?,
         };
         if outcome != Outcome::Done {

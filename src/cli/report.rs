@@ -5,10 +5,11 @@ use std::path::PathBuf;
 use clap::Args;
 
 use crate::cli::Outcome;
+use crate::cli::args::{end_on_signals, stop_flag};
 use crate::cli::ui::{self, Format};
 use crate::record::{Recording, build_link, build_policy, returns};
 use crate::registry::Spec;
-use crate::report::{Collected, Reference, Request, Summary, collect, write};
+use crate::report::{Collected, Reference, ReportError, Request, Summary, collect, write};
 use crate::scenario;
 
 /// Episodes of each reference policy, and their seed: the same rows in every report.
@@ -39,26 +40,34 @@ pub(super) struct ReportArgs {
 }
 
 pub(super) fn run(args: &ReportArgs) -> anyhow::Result<Outcome> {
-    let summary = make(args)?;
+    end_on_signals()?; // until there is something to clean up
+    let Some(summary) = make(args)? else {
+        ui::say("interrupted: nothing was written");
+        return Ok(Outcome::Interrupted);
+    };
     ui::say(&format!("{} figures and the tables are on {}", summary.figures, summary.page.display()));
     Ok(Outcome::Done)
 }
 
-/// Writes the report and prints the summary, but not where it lies.
-pub(super) fn make(args: &ReportArgs) -> anyhow::Result<Summary> {
+/// Writes the report and prints the summary, but not where it lies; `None` when a signal came first.
+pub(super) fn make(args: &ReportArgs) -> anyhow::Result<Option<Summary>> {
     crate::io::refuse_existing(&args.out, args.force).map_err(crate::Error::from)?;
     crate::storage::refuse_within_store(&args.out).map_err(crate::Error::from)?;
     let collected = collect(&args.runs, &args.mi).map_err(crate::Error::from)?;
     let command = command_line(std::env::args_os().map(|a| a.to_string_lossy().into_owned()));
     let references = references(&collected);
-    let request =
-        Request { out: &args.out, force: args.force, title: &args.title, command: &command, references: &references };
-    let summary = write(&collected, &request).map_err(crate::Error::from)?;
+    let (out, title) = (args.out.as_path(), args.title.as_str());
+    let stop = stop_flag()?;
+    let request = Request { out, force: args.force, title, command: &command, references: &references, stop };
+    let summary = match write(&collected, &request) {
+        Err(ReportError::Stopped) => return Ok(None),
+        other => other.map_err(crate::Error::from)?,
+    };
     match args.format {
         Format::Json => ui::print_json(&summary.tidy())?,
         Format::Table => print_table(&summary)?,
     }
-    Ok(summary)
+    Ok(Some(summary))
 }
 
 /// Returns of random policy and oracle on every task of the runs; a task that this build cannot play has none.

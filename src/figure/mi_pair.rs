@@ -50,6 +50,10 @@ const UPPER: &str = "≤ ";
 /// How many times farther than everything else an upper bound may lie.
 const FAR: f64 = 2.5;
 
+/// Most words along an axis, and characters of each.
+const MOST_WORDS: usize = 8;
+const WORD: usize = 8;
+
 enum Panel<'a> {
     Scatter(&'a Pair),
     Estimates(&'a [Whisker]),
@@ -161,7 +165,32 @@ fn scatter<DB: DrawingBackend>(area: &Area<DB>, pair: &Pair) -> Drawn<DB> {
     let (left, right) = range(pair.points.iter().map(|p| p.0));
     let (low, high) = range(pair.points.iter().map(|p| p.1));
     let mut chart = chart(&below, style::axis(left, right), style::axis(low, high))?;
-    mesh(&mut chart, &style::label(&pair.names[0], 38), &style::label(&pair.names[1], 28))?;
+    let names = [style::label(&pair.names[0], 38), style::label(&pair.names[1], 28)];
+    let (across, up) = (chart.x_range(), chart.y_range());
+    let ticks = |v: &f64, axis: usize, range: &std::ops::Range<f64>| {
+        if pair.levels[axis].is_empty() { style::short(*v, range.end - range.start) } else { String::new() }
+    };
+    let (x_label, y_label) = (|v: &f64| ticks(v, 0, &across), |v: &f64| ticks(v, 1, &up));
+    style::mesh_of(&mut chart, [5, 6], (&names[1], &y_label), (Some(&names[0]), &x_label))?;
+    let origin = below.get_pixel_range();
+    for (axis, levels) in pair.levels.iter().enumerate() {
+        // as many as there is room for
+        let every = levels.len().div_ceil(MOST_WORDS).max(1);
+        for (place, word) in (0..).zip(levels).step_by(every) {
+            let at = f64::from(place);
+            let (point, to, anchor, (dx, dy)) = if axis == 0 {
+                ((at, up.start), &across, (HPos::Center, VPos::Top), (0, 12))
+            } else {
+                ((across.start, at), &up, (HPos::Right, VPos::Center), (-12, 0))
+            };
+            if to.contains(&at) {
+                let (px, py) = chart.backend_coord(&point);
+                let tick = style::text(style::TICK, style::INK, anchor.0, anchor.1);
+                let word = style::label(word, WORD);
+                below.draw_text(&word, &tick, (px - origin.0.start + dx, py - origin.1.start + dy))?;
+            }
+        }
+    }
     let (size, ink) = if pair.points.len() > 400 { (5, 0.3) } else { (7, 0.5) };
     let color = style::color(0).mix(ink);
     chart.draw_series(pair.points.iter().map(|&at| Circle::new(at, size, color.filled())))?;

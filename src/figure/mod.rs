@@ -241,6 +241,7 @@ mod tests {
             mi_by_lag: shares(),
             pair: Pair {
                 names: ["<b>x".to_owned(), "\u{1}".to_owned()],
+                levels: [vec!["<b>".to_owned(), "\u{1}".to_owned()], Vec::new()],
                 points: (0..50).map(|i| (f64::from(i), f64::from(i * i % 17))).collect(),
                 estimates: vec![
                     Whisker { label: "<b>\u{1}".to_owned(), sign: "", value: 0.4, band: Some((0.3, 0.5)) },

@@ -5,6 +5,8 @@
 pub struct Pair {
     /// What stands on the two axes of the scatter.
     pub names: [String; 2],
+    /// The words at 0, 1, … of an axis of words; empty for an axis of numbers.
+    pub levels: [Vec<String>; 2],
     /// Points of the scatter.
     pub points: Vec<(f64, f64)>,
     /// Estimates with their intervals, on one scale.

@@ -159,6 +159,11 @@ impl Row for Estimate {
     }
 }
 
+/// A p-value as people read it: three decimals, and none of them a zero that it is not.
+pub fn p_text(p: f64) -> String {
+    if p < 0.001 { "<0.001".to_owned() } else { format!("{p:.3}") }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -188,5 +193,10 @@ mod tests {
         );
         let jsd = Estimate::new("jsd", &labels, 0.5, Unit::Jsd, Kind::LowerBound, 7);
         assert_eq!(jsd.clone().in_bits(), jsd);
+    }
+
+    #[test]
+    fn small_p_values_are_never_zero() {
+        assert_eq!([0.0, 0.000_999, 0.001, 0.0449, 1.0].map(p_text), ["<0.001", "<0.001", "0.001", "0.045", "1.000"]);
     }
 }

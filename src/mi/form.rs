@@ -60,7 +60,8 @@ pub fn to_csv<R: Row>(rows: &[R]) -> Result<Vec<u8>, String> {
     Ok(bytes)
 }
 
-/// Whether a file holds such rows and nothing else, by its ending and its columns; an empty file is nobody's.
+/// Whether a file holds such rows and nothing else, by its ending and its columns; an empty file is nobody's, and a list
+/// without a row may be anybody's.
 pub fn holds<R: Row>(path: &Path) -> bool {
     let keys: Vec<String> = R::columns(&[]).iter().map(|c| c.name().to_string()).collect();
     let Ok(file) = File::open(path) else { return false };
@@ -71,7 +72,7 @@ pub fn holds<R: Row>(path: &Path) -> bool {
         Some("json") => {
             let text = io::read_text(path, FILE_LIMIT).unwrap_or_default();
             let rows = serde_json::from_str::<Vec<serde_json::Map<String, serde_json::Value>>>(&text);
-            rows.is_ok_and(|rows| rows.iter().all(|row| row.keys().eq(&keys)))
+            rows.is_ok_and(|rows| !rows.is_empty() && rows.iter().all(|row| row.keys().eq(&keys)))
         }
         Some("csv") => {
             let mut header = String::new();
@@ -88,4 +89,22 @@ pub fn holds<R: Row>(path: &Path) -> bool {
 
 fn frame<R: Row>(rows: &[R]) -> Result<DataFrame, String> {
     DataFrame::new(rows.len(), R::columns(rows)).map_err(|e| e.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mi::{Estimate, Kind, Unit};
+    use crate::schema::SampleLabels;
+
+    #[test]
+    fn a_list_without_a_row_is_not_ours() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("rows.json");
+        let row = Estimate::new("gaussian", &SampleLabels::default(), 1.0, Unit::Nats, Kind::Estimate, 3);
+        for (bytes, ours) in [(b"[]".to_vec(), false), (to_json(&[row]).unwrap(), true), (b"[{}]".to_vec(), false)] {
+            io::write_atomic(&path, &bytes).unwrap();
+            assert_eq!(holds::<Estimate>(&path), ours);
+        }
+    }
 }

@@ -11,6 +11,8 @@ use crate::schema::{SampleLabels, Samples};
 /// Rows that stay together in a group of the jackknife, so that what neighbours share is not taken for evidence; their
 /// sums are made apart, so that rounding does not grow with the number of rows.
 const BLOCK: usize = 1024;
+/// Groups below which the interval is rough.
+const FEW: usize = 10;
 /// Said on the row.
 const NOTES: &str = "all rows in one pass; interval: jackknife over groups of 1024 rows, p: Wilks' test";
 
@@ -72,6 +74,13 @@ impl OnePass for GaussianPass {
             warnings.push(copy(labels));
         } else {
             interval(&mut out, (dx * dy) as f64, &total, &groups, dx + dy + given, &information);
+            let count = groups.len();
+            if out.interval_low.is_none() {
+                let rows = self.rows;
+                warnings.push(format!("no interval: {rows} rows are too few groups of {BLOCK}; give --memory more"));
+            } else if count < FEW {
+                warnings.push(format!("few blocks: the interval rests on {count} groups of {BLOCK} rows"));
+            }
             out.p_value = wilks(&left(&total), total.n, dx, dy, given);
         }
         warnings.push(format!("{NOTE}{NOTES}"));

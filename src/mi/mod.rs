@@ -61,7 +61,7 @@ mod unseen;
 
 pub use calibrate::{Calibrated, Drawn, Source, calibrate, calibrated};
 pub use checks::{Check, NORMALS, SERIES};
-pub use estimate::{Estimate, Kind, Unit};
+pub use estimate::{Estimate, Kind, Unit, p_text};
 pub use extrapolate::{DIVISIONS, Extrapolated, PartValue, extrapolated, part_value};
 pub use fit::Training;
 pub use form::{Row, holds, to_csv, to_json, to_parquet};

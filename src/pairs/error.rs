@@ -116,14 +116,32 @@ pub enum PairsError {
     },
     /// A column of a table that is read in pieces.
     #[error(
-        "column {name:?} holds both numbers and words, seen from row {row} on: a table this large is read in pieces, and a \
-         column must hold one of them: clean it, or give --memory more: {}", path.display()
+        "column {name:?} holds both {first} and {second}, seen from row {row} on: a large or sampled table is read in \
+         pieces, and a column must hold one of them: clean it, give --words {name} to take all as words, or --memory more: {}",
+        path.display()
     )]
     Mixed {
         /// Column.
         name: String,
+        /// What it held before.
+        first: &'static str,
+        /// What it holds in this piece.
+        second: &'static str,
         /// 1-based row of data at which the piece begins.
-        row: u64,
+        row: usize,
+        /// File.
+        path: PathBuf,
+    },
+    /// More words than any estimator can count.
+    #[error(
+        "column {name:?} holds more than {most} different words: expected categories; leave it out, or take a part by --where: {}",
+        path.display()
+    )]
+    TooManyWords {
+        /// Column.
+        name: String,
+        /// Most words.
+        most: usize,
         /// File.
         path: PathBuf,
     },
@@ -252,7 +270,7 @@ pub enum PairsError {
         most: usize,
     },
     /// A line that no table has.
-    #[error("line {line} is longer than {limit} bytes: not a table? {}", path.display())]
+    #[error("line {line} is longer than {limit} bytes: not a table, or a quotation mark without its pair: {}", path.display())]
     LongLine {
         /// 1-based line.
         line: u64,

@@ -4,8 +4,9 @@ use std::fs::File;
 use std::path::Path;
 use std::sync::Arc;
 
+use polars::io::parquet::metadata::FileMetadataRef;
 use polars::prelude::{
-    Column, DataFrame, NamedFrom as _, ParquetCompression, ParquetWriter, PlSmallStr, PolarsResult, Series,
+    Column, DataFrame, KeyValueMetadata, NamedFrom as _, ParquetCompression, ParquetWriter, PolarsResult, Series,
 };
 use rayon::prelude::*;
 
@@ -21,6 +22,8 @@ const TOGETHER: u64 = 4;
 const LEVELS: usize = 4;
 /// Probability that b is a.
 const COPIED: f64 = 0.7;
+/// Metadata key of such a table.
+const KEY: &str = "ccmarl.known";
 /// Names of the columns.
 const COLUMNS: [&str; 4] = ["x", "y", "a", "b"];
 
@@ -54,24 +57,29 @@ impl Known {
     /// [`PairsError`].
     pub fn write(&self, path: &Path, done: &mut dyn FnMut(u64) -> bool) -> Result<bool, PairsError> {
         io::create_parent(path)?;
-        let partial = io::partial_path(path);
-        let whole = self.write_at(&partial, done);
-        if matches!(whole, Ok(true)) {
-            std::fs::rename(&partial, path).map_err(IoError::os("put in place", path))?;
-        } else {
-            io::remove(&partial)?;
+        // a name that nobody else has: `.NAME.partial` may be a recording that `recover` can still put in place
+        let folder = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let mut options = tempfile::Builder::new();
+        options.prefix(".table.").suffix(".new");
+        #[cfg(unix)]
+        options.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666)); // less the umask, as of any file
+        let built = options.tempfile_in(folder).map_err(IoError::os("create", path))?;
+        if !self.write_to(built.as_file(), path, done)? {
+            return Ok(false); // dropped, it is gone
         }
-        whole
+        built.persist(path).map_err(|error| IoError::os("put in place", path)(error.error))?;
+        Ok(true)
     }
 
-    fn write_at(&self, path: &Path, done: &mut dyn FnMut(u64) -> bool) -> Result<bool, PairsError> {
+    fn write_to(&self, file: &File, path: &Path, done: &mut dyn FnMut(u64) -> bool) -> Result<bool, PairsError> {
         let unwritten = |error: polars::prelude::PolarsError| {
             let message = error.to_string().lines().next().unwrap_or_default().to_owned();
             IoError::os("write", path)(std::io::Error::other(message))
         };
-        let file = File::create(path).map_err(IoError::os("create", path))?;
         let schema = Arc::clone(self.group(0, 0).map_err(unwritten)?.schema());
         let writer = ParquetWriter::new(file).with_compression(ParquetCompression::Uncompressed);
+        let key = KeyValueMetadata::from_static(vec![(KEY.to_owned(), String::new())]);
+        let writer = writer.with_key_value_metadata(Some(key));
         let mut writer = writer.batched(&schema).map_err(unwritten)?;
         let groups = self.rows.div_ceil(GROUP);
         for first in (0..groups).step_by(TOGETHER as usize) {
@@ -86,7 +94,7 @@ impl Known {
             }
         }
         writer.finish().map_err(unwritten)?;
-        File::open(path).and_then(|file| file.sync_all()).map_err(IoError::os("sync", path))?;
+        file.sync_all().map_err(IoError::os("sync", path))?;
         Ok(true)
     }
 
@@ -115,12 +123,13 @@ impl Known {
     }
 }
 
-/// Whether a file is such a table, by its columns.
+/// Whether a file is such a table, by the key in its metadata: anybody's columns may have these names.
 pub fn is_known(path: &Path) -> bool {
     use polars::prelude::{ParquetReader, SerReader as _};
     let Ok(file) = File::open(path) else { return false };
-    let schema = io::caught(|| ParquetReader::new(file).schema());
-    schema.is_some_and(|schema| schema.is_ok_and(|s| s.iter_names().map(PlSmallStr::as_str).eq(COLUMNS)))
+    let metadata = io::caught(|| ParquetReader::new(file).get_metadata().cloned());
+    let has = |metadata: &FileMetadataRef| metadata.key_value_metadata().iter().flatten().any(|kv| kv.key == KEY);
+    metadata.is_some_and(|metadata| metadata.is_ok_and(|metadata| has(&metadata)))
 }
 
 #[cfg(test)]
@@ -165,5 +174,22 @@ mod tests {
         let mut left: Vec<_> = std::fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
         left.sort();
         assert_eq!(left, ["a.parquet", "b.parquet"]);
+    }
+    #[test]
+    fn what_another_command_left_beside_the_name_stays_and_anybodys_columns_are_not_ours() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("run.parquet");
+        let partial = io::partial_path(&path);
+        std::fs::create_dir(&partial).unwrap();
+        io::write_atomic(&partial.join("journal"), b"a recording").unwrap();
+        let known = Known { rows: 10, rho: 0.5, seed: 1 };
+        assert!(!known.write(&path, &mut |_| false).unwrap());
+        assert!(known.write(&path, &mut |_| true).unwrap());
+        assert_eq!(std::fs::read_to_string(partial.join("journal")).unwrap(), "a recording");
+        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 2);
+        assert!(is_known(&path));
+        let other = dir.path().join("other.parquet");
+        ParquetWriter::new(File::create(&other).unwrap()).finish(&mut known.group(0, 5).unwrap()).unwrap();
+        assert!(!is_known(&other));
     }
 }

@@ -51,7 +51,7 @@ fn later(y: &Columns, lag: usize) -> Columns {
     for r in 0..y.rows() {
         data.extend_from_slice(y.row((r + lag).min(y.rows() - 1)));
     }
-    Columns { data, names: y.names.clone(), words: y.words.clone() }
+    Columns { data, ..y.without_rows() }
 }
 
 fn too_short(samples: &Samples, lag: usize) -> PairsError {

@@ -32,6 +32,9 @@ pub enum ReportError {
     /// A figure.
     #[error(transparent)]
     Figure(#[from] FigureError),
+    /// The caller wanted no more of it.
+    #[error("interrupted: nothing was written")]
+    Stopped,
     /// A path that holds no run.
     #[error(
         "expected a run directory (with config.toml) or a directory of runs, found none: run `ccmarl train` first: {}",

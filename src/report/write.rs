@@ -1,12 +1,13 @@
 //! The output directory: figures, tables, page and provenance, published whole or not at all.
 
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde_json::json;
 
 use crate::figure::{self, Bar, Data, FIGURES};
 use crate::io::IoError;
-use crate::io::{create_parent, partial_path, publish, read_text, refuse_existing, write_atomic};
+use crate::io::{create_parent, publish, read_text, refuse_existing, write_atomic};
 use crate::registry::find;
 use crate::report::collect::{Collected, Task};
 use crate::report::markdown::{Grid, Line, caption, csv, document, escape, grid, table, tidy_csv};
@@ -34,6 +35,8 @@ pub struct Request<'a> {
     pub command: &'a str,
     /// Returns of random policy and oracle, where the caller has them.
     pub references: &'a [Reference],
+    /// Once it is true, nothing is written.
+    pub stop: &'a AtomicBool,
 }
 
 /// What was made.
@@ -64,16 +67,17 @@ pub fn write(collected: &Collected, request: &Request<'_>) -> Result<Summary, Re
     refuse_existing(request.out, request.force)?;
     refuse_foreign(request.out)?;
     create_parent(request.out)?;
-    let partial = partial_path(request.out);
-    let result = Output::start(&partial).and_then(|output| fill(output, collected, request)).and_then(|summary| {
-        refuse_foreign(request.out)?;
-        publish(&partial, request.out, request.force, MARKER)?;
-        Ok(summary)
-    });
-    if result.is_err() && partial.is_dir() {
-        std::fs::remove_dir_all(&partial).map_err(IoError::os("remove the unfinished", &partial))?;
-    }
-    result
+    // a name that nobody else has: `.NAME.partial` may be a recording that `recover` can still put in place
+    let folder = request.out.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let mut options = tempfile::Builder::new();
+    options.prefix(".report.").suffix(".new");
+    #[cfg(unix)]
+    options.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o777)); // less the umask, as of any directory
+    let built = options.tempdir_in(folder).map_err(IoError::os("create the directory", request.out))?;
+    let summary = fill(Output::start(built.path(), request.stop)?, collected, request)?;
+    refuse_foreign(request.out)?;
+    publish(built.path(), request.out, request.force, MARKER)?;
+    Ok(summary)
 }
 
 /// Refuses to replace anything but an earlier report with only its own files, or an empty directory.
@@ -110,23 +114,24 @@ fn refuse_foreign(out: &Path) -> Result<(), IoError> {
 }
 
 /// The directory under work.
-struct Output {
+struct Output<'a> {
     dir: PathBuf,
     figures: usize,
+    stop: &'a AtomicBool,
 }
 
-impl Output {
-    fn start(dir: &Path) -> Result<Self, ReportError> {
-        if dir.is_dir() {
-            std::fs::remove_dir_all(dir).map_err(IoError::os("remove the left-over", dir))?;
-        }
+impl<'a> Output<'a> {
+    fn start(dir: &Path, stop: &'a AtomicBool) -> Result<Self, ReportError> {
         for sub in ["figures", "tables"] {
             std::fs::create_dir_all(dir.join(sub)).map_err(IoError::os("create the directory", dir))?;
         }
-        Ok(Self { dir: dir.to_owned(), figures: 0 })
+        Ok(Self { dir: dir.to_owned(), figures: 0, stop })
     }
 
     fn text(&self, name: &str, text: &str) -> Result<(), ReportError> {
+        if self.stop.load(Ordering::Relaxed) {
+            return Err(ReportError::Stopped);
+        }
         Ok(write_atomic(&self.dir.join(name), text.as_bytes())?)
     }
 
@@ -141,7 +146,7 @@ impl Output {
     }
 }
 
-fn fill(mut output: Output, collected: &Collected, request: &Request<'_>) -> Result<Summary, ReportError> {
+fn fill(mut output: Output<'_>, collected: &Collected, request: &Request<'_>) -> Result<Summary, ReportError> {
     let published = Tables::load()?;
     let mut sections = Vec::new();
     let mut tables = Vec::new();
@@ -225,7 +230,7 @@ fn slug(text: &str) -> String {
 }
 
 fn task_section(
-    output: &mut Output,
+    output: &mut Output<'_>,
     task: &Task,
     runs: &[&Run],
     returns: Option<&Returns>,
@@ -289,7 +294,12 @@ fn task_section(
 }
 
 /// The best teams of runs that chose one, in a table of their own: chosen teams stand beside no last ones.
-fn best_section(output: &Output, task: &Task, convention: &str, runs: &[&Run]) -> Result<Option<Section>, ReportError> {
+fn best_section(
+    output: &Output<'_>,
+    task: &Task,
+    convention: &str,
+    runs: &[&Run],
+) -> Result<Option<Section>, ReportError> {
     let chosen = runs.iter().filter(|r| !r.best.is_empty());
     let best: Vec<Run> = chosen.map(|r| Run { episodes: r.best.clone(), ..(*r).clone() }).collect();
     let best: Vec<&Run> = best.iter().collect();
@@ -358,7 +368,7 @@ fn seen(returns: &Returns) -> String {
     format!("{}.", words.join("; "))
 }
 
-fn mutual_section(output: &mut Output, index: usize, file: &MutualFile) -> Result<Section, ReportError> {
+fn mutual_section(output: &mut Output<'_>, index: usize, file: &MutualFile) -> Result<Section, ReportError> {
     let id = format!("mi-{}", index + 1);
     let mut pictures = Vec::new();
     let mut notes = Vec::new();
@@ -397,7 +407,7 @@ fn mutual_section(output: &mut Output, index: usize, file: &MutualFile) -> Resul
     let line = |e: &crate::report::mutual::Estimate| {
         let agent = |a: &Option<String>| a.clone().unwrap_or_default();
         let interval = e.interval.map_or(String::new(), |(l, h)| format!("[{}, {}]", number(Some(l)), number(Some(h))));
-        let p = e.p_value.map_or(String::new(), |p| format!("{p:.3}"));
+        let p = e.p_value.map_or_else(String::new, crate::mi::p_text);
         vec![
             e.estimator.clone(),
             e.x.clone(),

@@ -14,12 +14,26 @@ pub struct Columns {
     pub names: Vec<String>,
     /// Per column, whether it holds words: numbers that stand for categories, whose size means nothing. Empty: none does.
     pub words: Vec<bool>,
+    /// Per column, the words that its numbers stand for, in order, if they are few and known. Empty: of none.
+    pub levels: Vec<Vec<String>>,
 }
 
 impl Columns {
     /// Columns of numbers.
     pub fn new(data: Vec<f64>, names: Vec<String>) -> Self {
-        Self { data, names, words: Vec::new() }
+        Self { data, names, ..Self::default() }
+    }
+
+    /// The same columns without a row.
+    #[must_use]
+    pub fn without_rows(&self) -> Self {
+        let Self { names, words, levels, .. } = self;
+        Self { data: Vec::new(), names: names.clone(), words: words.clone(), levels: levels.clone() }
+    }
+
+    /// The words of column `c`, if they are few and known.
+    pub fn levels(&self, c: usize) -> &[String] {
+        self.levels.get(c).map_or(&[], Vec::as_slice)
     }
 
     /// Whether column `c` holds words.

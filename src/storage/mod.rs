@@ -241,6 +241,15 @@ pub enum StorageError {
         /// Where.
         path: PathBuf,
     },
+    /// A store beside which lies what was to replace it.
+    #[error(
+        "beside this store lies what did not finish; `ccmarl recover --force {}` puts its whole episodes in place of the store; to keep both, give the store another name first and leave out --force: {}",
+        printable(path), path.display()
+    )]
+    Beside {
+        /// The store.
+        path: PathBuf,
+    },
     /// What a kill left holds nothing.
     #[error("killed before its first episode was committed: there is nothing to recover; start again with --force: {}", path.display())]
     Empty {
@@ -266,6 +275,7 @@ impl StorageError {
                 | Self::Slash { .. }
                 | Self::Within { .. }
                 | Self::Same(_)
+                | Self::Beside { .. }
                 | Self::Io(IoError::Exists(_))
         )
     }

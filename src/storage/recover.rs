@@ -114,6 +114,9 @@ pub fn recover(
         let planned = store.manifest().planned.max(episodes);
         return Ok(Some(Recovered { path: target, episodes, planned, ended: None, kept: None }));
     }
+    if leftover != target && !force && target.symlink_metadata().is_ok() {
+        return Err(StorageError::Beside { path: target });
+    }
     io::refuse_existing(&target, force)?;
     names::refuse_foreign(&target)?;
     let mut source = (format.salvage)(&leftover)?;

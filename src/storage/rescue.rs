@@ -33,7 +33,8 @@ impl Rescued {
 /// for it. `path` is only read. Memory is bounded. `None` when `stop` turned true; nothing is left then.
 ///
 /// # Errors
-/// [`StorageError::Whole`] when nothing is wrong with `path`; [`StorageError`] when no manifest in it can be trusted, it
+/// [`StorageError::Whole`] when nothing is wrong with `path`, and [`StorageError::Beside`] when what was to replace it lies
+/// beside it; [`StorageError`] when no manifest in it can be trusted, it
 /// is what a kill left, `to` exists (without `force`), or the disk refuses.
 pub fn rescue(
     path: &Path,
@@ -45,12 +46,18 @@ pub fn rescue(
     names::check_output(to, force)?;
     names::refuse_same(path, to)?;
     if let Some((left, target)) = recover::unfinished(path) {
+        if target.exists() {
+            return Err(StorageError::Beside { path: target });
+        }
         return Err(names::unfinished(&target, left));
     }
     if !path.exists() {
         return Err(IoError::Missing(path.to_owned()).into());
     }
     match read(path, &mut Findings::new(&mut |_, _| None)) {
+        Ok(()) if recover::left_beside(path).is_some() => {
+            return Err(StorageError::Beside { path: path.to_owned() });
+        }
         Ok(()) => return Err(StorageError::Whole { path: path.to_owned() }),
         Err(error @ (StorageError::Io(_) | StorageError::NotAStore { .. })) => return Err(error),
         Err(_) => {}

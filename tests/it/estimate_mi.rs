@@ -242,6 +242,11 @@ fn a_picture_never_takes_the_results_away() {
         let (code, _, err) = run(&[&args[..], &["--plot", &at(name)]].concat());
         assert!(code == 0 && dir.path().join(name).exists(), "{err}");
     }
+    let (code, _, err) = run(&[&args[..], &["--plot", &at("newer/pairs.svg")]].concat());
+    assert!(code == 2 && err.contains("give --force to replace it, or another --plot: "), "{code}: {err}");
+    std::fs::write(at("mine.svg"), "mine").unwrap();
+    let (code, _, err) = run(&[&args[..], &["--force", "--plot", &at("mine.svg")]].concat());
+    assert!(code == 1 && err.contains("remove it by hand, or give another --plot: "), "{code}: {err}");
     let (code, out, err) = run(&[&args[..], &["--plot", &format!("{other}/pairs.png")]].concat());
     assert!(code == 1 && out.contains("a ; b") && err.contains("could not create the directory"), "{code}: {out}{err}");
     // one cell would stand for several lags
@@ -331,6 +336,18 @@ fn a_table_that_memory_does_not_hold_is_read_once_and_says_what_was_estimated_ho
     let plot = dir.path().join("large.svg").to_string_lossy().into_owned();
     let (code, _, err) = run(&[&base[..], &["--memory", "0", "--plot", &plot]].concat());
     assert!(code == 0 && std::fs::read_to_string(plot).unwrap().contains("2000 points"), "{err}");
+    // a first line that is blank, with either line end, is none in pieces either
+    for blank in ["\n", "\r\n", "\n\n"] {
+        let table = write(dir.path(), "blank.csv", &format!("{blank}{text}"));
+        let args = [&[table.as_str()], &base[1..]].concat();
+        let rows = [&args[..], &[&args[..], &["--memory", "0"]].concat()].map(json);
+        assert_eq!([value(&rows[0][0]), value(&rows[1][1])], [value(&whole[0]), value(&whole[1])], "{blank:?}");
+    }
+    // who needs no words reads no more of them
+    let words: String = (0..40_000).map(|row| format!("w{row},1\n")).collect();
+    let many = write(dir.path(), "many.csv", &format!("a,b\n{words}"));
+    let (code, _, err) = run(&[many.as_str(), "--x", "a", "--y", "b", "--estimator", "gaussian", "--memory", "0"]);
+    assert!(code == 2 && err.contains("a holds words"), "{code}: {err}");
     for (code, args, message) in [
         (
             2,
@@ -608,6 +625,11 @@ fn calibrate_prints_errors_and_refuses_unknown_tasks() {
     ccmarl::io::write_atomic(table.as_ref(), b"mine\n").unwrap();
     let (code, _, err) = calibrate(&[&args[..], &["--force"]].concat());
     assert!(code != 0 && std::fs::read_to_string(&table).unwrap() == "mine\n", "{err}");
+    // no task has a value, and the checks have: they are shown, and there is nothing to draw
+    let few = ["--estimator", "gaussian", "--n", "10", "--seeds", "1", "--task", "dense-25-25", "--checks", "2"];
+    let (code, out, err) = calibrate(&[&few[..], &["--plot", &at("none.svg")]].concat());
+    assert!(code == 0 && out.contains("normal-2-2-0.75"), "{err}");
+    assert!(err.contains("note: no value of a task to draw: ") && !Path::new(&at("none.svg")).exists());
     let (code, _, err) = calibrate(&["--out", "rows.txt"]);
     assert!(code == 2 && err.contains("expected a name that ends in .json, .csv or .parquet"), "{err}");
 }

@@ -58,6 +58,7 @@ fn data() -> Data {
         mi_by_lag: shares,
         pair: Pair {
             names: ["wind".to_owned(), "power".to_owned()],
+            levels: <[Vec<String>; 2]>::default(),
             points: (0..200).map(|i| (f64::from(i) * 0.01, f64::from(i * i % 173) * 0.02)).collect(),
             estimates: vec![
                 Whisker { label: "gaussian".to_owned(), sign: "", value: 0.4133, band: Some((0.38, 0.45)) },
@@ -86,6 +87,25 @@ fn data() -> Data {
         cells,
         axes: <[String; 2]>::default(),
     }
+}
+
+#[test]
+fn an_axis_of_words_has_the_words_where_an_axis_of_numbers_has_numbers() {
+    let entry = FIGURES.iter().find(|entry| entry.name == "mi-pair").unwrap();
+    let mut data = data();
+    data.pair = Pair {
+        names: ["size".to_owned(), "color".to_owned()],
+        levels: [["small", "tall"].map(str::to_owned).to_vec(), (0..20).map(|i| format!("hue{i}")).collect()],
+        points: (0..40).map(|i| (f64::from(i % 2), f64::from(i % 20))).collect(),
+        ..Pair::default()
+    };
+    let text = svg(entry, &data).unwrap();
+    let has = |word: &str| text.contains(&format!("\n{word}\n"));
+    assert!(["small", "tall", "hue0", "hue3", "hue18"].into_iter().all(has), "{text}");
+    assert!(!has("hue1") && !has("0.5") && !has("10"), "{text}");
+    data.pair.levels = <[Vec<String>; 2]>::default();
+    let text = svg(entry, &data).unwrap();
+    assert!(text.contains("\n0.5\n") && text.contains("\n10\n"), "{text}");
 }
 
 #[test]

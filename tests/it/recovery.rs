@@ -446,6 +446,37 @@ fn a_damaged_manifest_is_not_believed_where_a_copy_can_be() {
 }
 
 #[test]
+fn what_was_to_replace_a_store_is_named_and_both_can_be_kept() {
+    let layout = small();
+    let directory = tempfile::tempdir().unwrap();
+    let at = |name: &str| directory.path().join(name);
+    let episodes = some(&layout, 3);
+    write(&at("tag"), &layout, &episodes[..1], false).unwrap();
+    fs::rename(at("tag"), at("aside")).unwrap();
+    killed(&at("tag"), &layout, &episodes, 5);
+    fs::rename(at("aside"), at("tag")).unwrap();
+    let path = at("tag").to_string_lossy().into_owned();
+    let partial = at(".tag.partial").to_string_lossy().into_owned();
+    for words in [
+        &["recover", &path, "--out", at("new").to_str().unwrap()][..],
+        &["recover", &partial, "--out", at("new").to_str().unwrap()],
+        &["recover", &path],
+    ] {
+        let (code, _, err) = ccmarl(words);
+        assert_eq!(code, 2, "{err}");
+        let said =
+            format!("beside this store lies what did not finish; `ccmarl recover --force {path}` puts its whole");
+        assert!(
+            err.contains(&said) && err.contains("give the store another name first and leave out --force"),
+            "{err}"
+        );
+    }
+    fs::rename(at("tag"), at("old")).unwrap();
+    assert_eq!(recover(&at("tag"), false).unwrap().episodes, 3);
+    assert_eq!((read(&at("tag")).unwrap().len(), read(&at("old")).unwrap().len()), (3, 1));
+}
+
+#[test]
 fn saving_refuses_what_is_whole_unfinished_taken_or_missing() {
     let layout = small();
     let directory = tempfile::tempdir().unwrap();

@@ -78,8 +78,43 @@ fn report(inputs: &[PathBuf], mi: &[PathBuf], out: &Path) -> Result<Summary, Err
     let collected = collect(inputs, mi)?;
     let task = Task { scenario: "simple_spread".to_owned(), profile: "paper".to_owned(), agents: 3 };
     let references = [Reference { task, random: vec![-200.0, -248.0], oracle: vec![-60.0, -80.0] }];
-    let request = Request { out, force: false, title: "Two runs", command: "ccmarl report", references: &references };
+    let stop = std::sync::atomic::AtomicBool::new(false);
+    let request = Request {
+        out,
+        force: false,
+        title: "Two runs",
+        command: "ccmarl report",
+        references: &references,
+        stop: &stop,
+    };
     Ok(write(&collected, &request)?)
+}
+
+#[test]
+fn a_signal_leaves_nothing_and_a_recording_of_the_same_name_stays() {
+    let dir = tempfile::tempdir().unwrap();
+    two_runs(&dir.path().join("runs"));
+    let collected = collect(&[dir.path().join("runs")], &[]).unwrap();
+    let out = dir.path().join("r");
+    std::fs::create_dir(dir.path().join(".r.partial")).unwrap();
+    let names = || {
+        let mut names: Vec<_> = std::fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
+        names.sort();
+        names
+    };
+    for stopped in [true, false] {
+        let stop = std::sync::atomic::AtomicBool::new(stopped);
+        let request =
+            Request { out: &out, force: false, title: "x", command: "ccmarl report", references: &[], stop: &stop };
+        let written = write(&collected, &request).map_err(|e| e.to_string());
+        if stopped {
+            assert_eq!(written.unwrap_err(), "interrupted: nothing was written");
+            assert_eq!(names(), [".r.partial", "runs"]);
+        } else {
+            written.unwrap();
+            assert_eq!(names(), [".r.partial", "r", "runs"]);
+        }
+    }
 }
 
 fn read(path: impl AsRef<Path>) -> String {

@@ -44,6 +44,7 @@ fn commands_that_only_read_or_write_at_their_end_exit_4_at_once() {
         vec!["estimate-mi", &at("x.parquet"), "--out", &at("mi.json")],
         vec!["pairs", &at("x.parquet"), "--out", &at("pairs.parquet")],
         vec!["evaluate", &at("run")],
+        vec!["report", "--mi", &at("x.parquet"), "--out", &at("page")],
         vec!["fit-link", &at("x.parquet"), "--out", &at("link.json")],
         vec!["link", "simulate", &format!("file:{}", at("run/config.toml")), "--out", &at("drawn")],
     ] {

@@ -84,21 +84,31 @@ pub(super) fn data(rows: &[Estimate], samples: &Samples, seed: u64, pieces: Piec
         line: (found.limit / scale, found.slope / scale),
     });
     let (names, points) = scatter(samples, &Seeds::new(seed).child("plot"));
+    let levels = [&samples.x, &samples.y].map(|columns| columns.levels(0).to_vec());
+    let estimates: Vec<Whisker> = shown.map(whisker).collect();
+    let bounds =
+        if estimates.iter().any(|w| !w.sign.is_empty()) { "; rings are bounds: ≥ lower, ≤ upper" } else { "" };
+    let limit = if shrunk.is_some() { "; the ring at n = ∞ is where its line leads" } else { "" };
+    let all = samples.len();
+    let what = match (points.len(), estimates.len()) {
+        (drawn, 0) => format!("{drawn} of {all} samples, and no estimate: none is finite"),
+        (drawn, _) => format!("{drawn} of {all} samples and their estimates"),
+    };
     let given = labels.given.as_ref().map_or(String::new(), |given| format!(" | {given}"));
     let data = Data {
         title: format!("{} ; {}{given}", labels.x, labels.y),
-        subtitle: format!("{} samples; rings are bounds: ≥ lower, ≤ upper", samples.len()),
+        subtitle: format!("{all} samples{bounds}{limit}"),
         unit: format!("mutual information, {}", unit.name()),
         pair: Pair {
             names,
+            levels,
             points,
-            estimates: shown.map(whisker).collect(),
+            estimates,
             shrunk,
             trainings: pieces.trainings.into_iter().map(training).collect(),
         },
         ..Data::default()
     };
-    let what = format!("{} of {} samples and their estimates", data.pair.points.len(), samples.len());
     (data, what)
 }
 
@@ -170,6 +180,7 @@ fn axis_name(columns: &Columns, label: &str, spread: bool) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::mi::Kind;
     use crate::schema::{Exchange, SampleLabels};
 
     fn samples(x: Columns, y: Columns) -> Samples {
@@ -187,10 +198,31 @@ mod tests {
     }
 
     #[test]
+    fn the_words_beside_a_picture_say_what_is_in_it() {
+        let column = |name: &str, levels: &[&str]| Columns {
+            levels: vec![levels.iter().map(ToString::to_string).collect()],
+            ..Columns::new(vec![0.0, 1.0, 0.0, 1.0], vec![name.to_owned()])
+        };
+        let samples = samples(column("a", &["no", "yes"]), column("b", &[]));
+        let row = |value, kind| Estimate::new("gaussian", &samples.labels, value, Unit::Nats, kind, 4);
+        let said = |rows: &[Estimate]| {
+            let (data, what) = data(rows, &samples, 1, Pieces { trainings: Vec::new(), extrapolated: None });
+            assert_eq!(data.pair.levels, [vec!["no".to_owned(), "yes".to_owned()], Vec::new()]);
+            (data.subtitle, what)
+        };
+        let of = |subtitle: &str, what: &str| (subtitle.to_owned(), what.to_owned());
+        let infinite = said(&[row(f64::INFINITY, Kind::Estimate)]);
+        assert_eq!(infinite, of("4 samples", "4 of 4 samples, and no estimate: none is finite"));
+        let bound = said(&[row(1.0, Kind::LowerBound)]);
+        assert_eq!(bound, of("4 samples; rings are bounds: ≥ lower, ≤ upper", "4 of 4 samples and their estimates"));
+    }
+
+    #[test]
     fn many_samples_are_drawn_from_and_the_axes_say_what_was_done() {
         let wide = Columns::new((0..10_000).map(f64::from).collect(), vec!["a".to_owned(), "b".to_owned()]);
         let words = (0..5000).map(|i| f64::from(i % 3)).collect();
-        let words = Columns { data: words, names: vec!["c".to_owned()], words: vec![true] };
+        let levels = vec![["red", "green", "blue"].map(str::to_owned).to_vec()];
+        let words = Columns { data: words, names: vec!["c".to_owned()], words: vec![true], levels };
         let samples = samples(wide, words);
         let (names, points) = scatter(&samples, &Seeds::new(1));
         assert_eq!(names, ["a (first of 2 columns)", "c (words in order, spread)"]);

@@ -1,5 +1,6 @@
 //! Samples of the columns that were chosen.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -10,6 +11,45 @@ use super::rows::Part;
 use super::several::Table;
 use crate::pairs::PairsError;
 use crate::schema::{Columns, Exchange, NOTE, SampleLabels, Samples};
+
+/// Columns that sets of samples of one part have alike: those of the same rows in the same order.
+#[derive(Default)]
+pub(super) struct Shared(Vec<Choice>);
+
+/// Rows in an order, and the columns picked so.
+struct Choice {
+    rows: Vec<usize>,
+    starts: Arc<[usize]>,
+    columns: BTreeMap<Vec<String>, Arc<Columns>>,
+}
+
+/// Most choices that are remembered: columns with gaps have one per pair, and each costs a number per row.
+const CHOICES: usize = 4;
+
+impl Shared {
+    fn of(&mut self, rows: &[usize], starts: Vec<usize>) -> &mut Choice {
+        let found = self.0.iter().position(|choice| choice.rows == rows && *choice.starts == starts[..]);
+        let at = found.unwrap_or_else(|| {
+            if self.0.len() == CHOICES {
+                self.0.remove(0);
+            }
+            self.0.push(Choice { rows: rows.to_vec(), starts: starts.into(), columns: BTreeMap::new() });
+            self.0.len() - 1
+        });
+        &mut self.0[at]
+    }
+}
+
+impl Choice {
+    fn pick(&mut self, columns: &Columns, named: &[String]) -> Arc<Columns> {
+        let rows = &self.rows;
+        let picked = self.columns.entry(named.to_vec()).or_insert_with(|| {
+            let data = rows.iter().flat_map(|&r| columns.row(r).iter().copied()).collect();
+            Arc::new(Columns { data, ..columns.without_rows() })
+        });
+        Arc::clone(picked)
+    }
+}
 
 /// The chosen columns of a table, as numbers.
 pub(super) struct Chosen<'a> {
@@ -42,6 +82,11 @@ impl<'a> Chosen<'a> {
 
     /// The samples among the rows of a part. Rows with a missing value are left out and counted in the notes.
     pub(super) fn samples(&self, part: &Part) -> Result<Samples, PairsError> {
+        self.sharing(part, &mut Shared::default())
+    }
+
+    /// The same samples; columns that other samples of this part have alike are shared with them.
+    pub(super) fn sharing(&self, part: &Part, shared: &mut Shared) -> Result<Samples, PairsError> {
         let Self { x, y, z, group, time, options, .. } = self;
         let whole = |r: usize| {
             let values = || x.row(r).iter().chain(y.row(r)).chain(z.row(r));
@@ -78,16 +123,13 @@ impl<'a> Chosen<'a> {
         if let Some(within) = &part.within {
             label = format!("{label}, {within}");
         }
-        let pick = |columns: &Columns| {
-            let data = rows.iter().flat_map(|&r| columns.row(r).iter().copied()).collect();
-            Arc::new(Columns { data, names: columns.names.clone(), words: columns.words.clone() })
-        };
         let given = (!options.given.is_empty()).then(|| options.given.join(","));
+        let choice = shared.of(&rows, starts);
         Ok(Samples {
-            x: pick(x),
-            y: pick(y),
-            z: given.is_some().then(|| pick(z)),
-            starts: starts.into(),
+            x: choice.pick(x, &options.x),
+            y: choice.pick(y, &options.y),
+            z: given.is_some().then(|| choice.pick(z, &options.given)),
+            starts: Arc::clone(&choice.starts),
             rows: (0..rows.len() as u32).collect(),
             exchange,
             labels: SampleLabels {

@@ -8,15 +8,15 @@ use super::form::open;
 use crate::io::IoError;
 use crate::pairs::PairsError;
 
-/// Longest line, bytes.
-const LINE: usize = 16 << 20;
+/// Longest line, bytes; a line end within quotes ends none.
+pub(super) const LINE: usize = 16 << 20;
 
 /// Pieces of about `size` bytes. A line end within quotes ends no line.
 pub(super) struct Lines {
     file: File,
     path: PathBuf,
     size: usize,
-    /// The first line, with its end.
+    /// The first line that is not blank, with its end and what stands before.
     header: Vec<u8>,
     /// What was read and not yet handed out.
     rest: Vec<u8>,
@@ -38,7 +38,7 @@ impl Lines {
             while !self.ended && self.rest.len() < least {
                 self.fill()?;
             }
-            let found = if self.rest.len() >= least { end(&self.rest) } else { None };
+            let found = if self.ended || self.rest.len() >= least { end(&self.rest) } else { None };
             if let Some(at) = found {
                 let after = self.rest.split_off(at);
                 return Ok(std::mem::replace(&mut self.rest, after));
@@ -82,15 +82,17 @@ impl Iterator for Lines {
     }
 }
 
-/// Behind the end of the first line.
+/// Behind the end of the first line that is not blank.
 fn first_line(text: &[u8]) -> Option<usize> {
-    let mut quoted = false;
-    text.iter()
-        .position(|&byte| {
-            quoted ^= byte == b'"';
-            byte == b'\n' && !quoted
-        })
-        .map(|at| at + 1)
+    let (mut quoted, mut blank) = (false, true);
+    for (at, &byte) in text.iter().enumerate() {
+        quoted ^= byte == b'"';
+        blank &= matches!(byte, b'\n' | b'\r');
+        if byte == b'\n' && !quoted && !blank {
+            return Some(at + 1);
+        }
+    }
+    None
 }
 
 /// Behind the end of the last line that ends.
@@ -134,6 +136,9 @@ mod tests {
             let found = pieces(text, size);
             let joined: String = found.iter().map(|piece| piece.strip_prefix(header).unwrap()).collect();
             assert_eq!(format!("{header}{joined}"), text, "{size}");
+        }
+        for size in 1..9 {
+            assert_eq!(pieces("\r\n\na,b\n1,2\n", size), ["\r\n\na,b\n1,2\n"]);
         }
         assert_eq!(pieces("a,b\n", 10), [""; 0]);
         assert_eq!(pieces("", 10), [""; 0]);

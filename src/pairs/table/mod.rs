@@ -2,8 +2,10 @@
 //!
 //! [`form`] reads a file, whatever its form; [`cells`] says what its text is; [`names`] which columns are meant;
 //! [`several`] makes one table of several files; [`numbers`] makes numbers of columns; [`order`] puts rows into episodes;
-//! [`chosen`] makes samples of them. [`pass`] does all this piece by piece, and [`sample`] draws rows meanwhile.
+//! [`chosen`] makes samples of them. [`pass`] does all this piece by piece, for which [`alike`] holds what is the same
+//! in all of them, and [`sample`] draws rows meanwhile.
 
+mod alike;
 mod cells;
 mod chosen;
 mod form;
@@ -23,7 +25,7 @@ mod topics;
 
 use std::path::{Path, PathBuf};
 
-use self::chosen::Chosen;
+use self::chosen::{Chosen, Shared};
 pub use self::form::PieceSize;
 use self::form::guarded;
 use self::numbers::Holds;
@@ -156,13 +158,14 @@ pub fn all_pairs(paths: &[PathBuf], options: &TableOptions) -> Result<(Vec<Sampl
         let is_empty = |name: &String| table.frame.column(name).is_ok_and(|c| c.null_count() == rows);
         let (empty, full): (Vec<String>, Vec<String>) = columns.into_iter().partition(is_empty);
         let (mut sets, mut last) = (Vec::new(), None);
+        let mut shared: Vec<Shared> = parts.iter().map(|_| Shared::default()).collect();
         left_out.extend(empty.iter().map(|name| format!("column {name:?} is empty")));
         for (i, j) in (0..full.len()).flat_map(|i| (i + 1..full.len()).map(move |j| (i, j))) {
             let (x, y) = (vec![full[i].clone()], vec![full[j].clone()]);
             let options = TableOptions { x, y, ..options.clone() };
             let chosen = Chosen::of(&table, &options)?;
-            for part in &parts {
-                match chosen.samples(part) {
+            for (part, shared) in parts.iter().zip(&mut shared) {
+                match chosen.sharing(part, shared) {
                     Ok(set) => sets.push(set),
                     Err(error) => {
                         let within = part.within.as_ref().map(|within| format!("{within}: ")).unwrap_or_default();
@@ -205,4 +208,33 @@ fn whole<T>(paths: &[PathBuf], read: impl FnOnce() -> Result<T, PairsError>) -> 
         let message = "its columns cannot be used: the file is damaged".to_owned();
         Err(PairsError::Unreadable { form: "data", message, path: path.clone() })
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+
+    #[test]
+    fn all_pairs_have_every_column_once_where_no_value_is_missing() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("t.csv");
+        crate::io::write_atomic(&path, b"a,b,c,d\n1,2,3,4\n2,3,5,\n4,4,4,8\n").unwrap();
+        let (sets, _) = all_pairs(std::slice::from_ref(&path), &TableOptions::default()).unwrap();
+        let named = |x: &str, y: &str| sets.iter().find(|s| s.labels.x == x && s.labels.y == y).unwrap();
+        assert_eq!(sets.len(), 6);
+        assert!(Arc::ptr_eq(&named("a", "b").x, &named("a", "c").x));
+        assert!(Arc::ptr_eq(&named("a", "c").y, &named("b", "c").y));
+        assert!(Arc::ptr_eq(&named("a", "b").starts, &named("b", "c").starts));
+        assert!(Arc::ptr_eq(&named("b", "d").y, &named("c", "d").y));
+        for set in &sets {
+            let one = TableOptions {
+                x: vec![set.labels.x.clone()],
+                y: vec![set.labels.y.clone()],
+                ..TableOptions::default()
+            };
+            assert_eq!(*set, table(&path, &one).unwrap());
+        }
+    }
 }

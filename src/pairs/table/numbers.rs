@@ -83,8 +83,12 @@ pub(super) fn not_numeric(table: &Table, column: &Column) -> PairsError {
     PairsError::NotNumeric { name: column.name().to_string(), kind, hint, path: table.path() }
 }
 
-/// A column of words as the ranks of its words, a missing one NaN; `None` for any other column.
-fn ranks(column: &Column) -> Option<Vec<f64>> {
+/// Most words of a column that are kept beside their ranks: a picture has no place for more.
+const LEVELS: usize = 20;
+
+/// A column of words as the ranks of its words, a missing one NaN, and the words if they are few; `None` for any other
+/// column.
+fn ranks(column: &Column) -> Option<(Vec<f64>, Vec<String>)> {
     if Holds::of(column.dtype()) != Holds::Words {
         return None;
     }
@@ -94,7 +98,8 @@ fn ranks(column: &Column) -> Option<Vec<f64>> {
     levels.sort_unstable();
     levels.dedup();
     let rank = |word: Option<&str>| word.map_or(f64::NAN, |word| levels.partition_point(|l| *l < word) as f64);
-    Some(words.iter().map(rank).collect())
+    let few = levels.iter().filter(|_| levels.len() <= LEVELS).map(|&word| word.to_owned()).collect();
+    Some((words.iter().map(rank).collect(), few))
 }
 
 /// Named columns side by side, vectors flattened, words ranked; a missing value is NaN.
@@ -105,12 +110,16 @@ pub(super) fn numbers(table: &Table, names: &[String]) -> Result<Columns, PairsE
         let column = table.column(name)?;
         let words = ranks(column);
         let is_words = words.is_some();
-        let (width, values) = words.map_or_else(|| flat(table, column), |words| Ok((1, words)))?;
+        let (width, values, levels) = match words {
+            Some((ranks, levels)) => (1, ranks, levels),
+            None => flat(table, column).map(|(width, values)| (width, values, Vec::new()))?,
+        };
         if let Some(at) = values.iter().position(|v| v.abs() > LARGEST) {
             let (row, path) = table.place(at / width);
             return Err(PairsError::Infinite { name: name.clone(), row, value: values[at], path });
         }
         out.words.extend(std::iter::repeat_n(is_words, width));
+        out.levels.extend(std::iter::repeat_n(levels, width));
         if width == 1 && Holds::of(column.dtype()) != Holds::Other {
             out.names.push(name.clone());
         } else {

@@ -1,15 +1,11 @@
 //! One pass over a table that memory does not hold: pieces of samples one after the other, and a random sample beside.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
-use polars::prelude::{Column, DataType, NamedFrom as _, Series};
-
+use super::alike::Alike;
 use super::chosen::Chosen;
-use super::form::{PieceSize, TableFile, caught, unreadable};
+use super::form::{PieceSize, TableFile, caught};
 use super::names::expanded;
-use super::numbers::{Holds, per_second};
 use super::rows::{self, parts};
 use super::sample::{Drawn, Sample};
 use super::several::{self, Table};
@@ -58,40 +54,44 @@ pub fn size(paths: &[PathBuf], options: &TableOptions) -> Result<u64, PairsError
 }
 
 /// Reads a table once: `each` gets the samples of every piece, in which words are numbered alike, and where the pass
-/// stands; `options.sample` rows are drawn beside. Every row stands for itself: no group, no order, no parts. Dates are
-/// seconds since 1970.
+/// stands, and says whether it wants more; `options.sample` rows are drawn beside, to the end. Every row stands for itself:
+/// no group, no order, no parts.
 ///
 /// # Errors
-/// As [`super::tables()`]; [`PairsError::Mixed`] for a column that holds numbers in one piece and words in another.
+/// As [`super::tables()`]; [`PairsError::Mixed`] for a column that holds numbers in one piece and words in another;
+/// [`PairsError::TooManyWords`].
 pub fn pass(
     paths: &[PathBuf],
     options: &TableOptions,
     size: PieceSize,
-    each: &mut dyn FnMut(&Samples, Progress),
+    each: &mut dyn FnMut(&Samples, Progress) -> bool,
 ) -> Result<Passed, PairsError> {
     whole(paths, || {
         let of = rows_of(paths)?;
-        let mut words = Words::default();
-        let (mut used, mut last) = (0_u64, None);
+        let (mut used, mut last, mut wanted, mut notes) = (0_u64, None, true, Vec::new());
         let mut drawn = options.sample.as_ref().map(Drawn::new);
-        let read = over(paths, options, size, &mut |table, places, read, path, options| {
+        let read = over(paths, options, size, &mut |table, places, read, alike| {
             if let Some(drawn) = &mut drawn {
-                drawn.add(&table.frame, places, path)?;
+                drawn.add(&table.frame, places, &table.path())?;
             }
-            words.number(table, options, read.before, path)?;
+            if !wanted {
+                return Ok(drawn.is_some());
+            }
+            alike.number(table, &read.options, &table.path())?;
+            notes = alike.notes(&read.options);
             let all = parts(table, &[])?;
-            let found = all.iter().map(|part| Chosen::of(table, options)?.samples(part)).next();
+            let found = all.iter().map(|part| Chosen::of(table, &read.options)?.samples(part)).next();
             match found {
                 Some(Ok(mut set)) => {
-                    words.mark(&mut set);
+                    alike.mark(&mut set);
                     used += set.len() as u64;
-                    each(&set, Progress { rows: read.rows, of });
+                    wanted = each(&set, Progress { rows: read.rows, of });
                     last = Some(set);
-                    Ok(())
                 }
-                Some(Err(PairsError::NoRows { .. })) | None => Ok(()),
-                Some(Err(error)) => Err(moved(error, read.before)),
+                Some(Err(PairsError::NoRows { .. })) | None => {}
+                Some(Err(error)) => return Err(error),
             }
+            Ok(wanted || drawn.is_some())
         })?;
         let columns = [&read.options.x, &read.options.y, &read.options.given].map(Vec::as_slice).concat();
         let columns = columns.join(", ");
@@ -105,12 +105,11 @@ pub fn pass(
                 _ => PairsError::NoRows { rows: read.kept as usize, columns, path },
             });
         };
-        let mut notes = Vec::new();
-        if used < read.kept {
+        let of_columns = std::mem::take(&mut notes);
+        if wanted && used < read.kept {
             notes.push(format!("{} of {} rows left out: a missing value in {columns}", read.kept - used, read.kept));
         }
-        notes.extend(read.filtered_note().map(|note| format!("{NOTE}{note}")));
-        notes.extend(words.dates.iter().map(|name| format!("{NOTE}dates of {name} are seconds since 1970")));
+        notes.extend(read.filtered_note().into_iter().chain(of_columns).map(|note| format!("{NOTE}{note}")));
         let rows = read.rows;
         if let Some(drawn) = drawn {
             let (table, options) = read.drawn(drawn)?;
@@ -130,8 +129,9 @@ pub(super) fn drawn(
     sample: &Sample,
 ) -> Result<(Table, TableOptions), PairsError> {
     let mut drawn = Drawn::new(sample);
-    let read = over(paths, options, PieceSize::default(), &mut |table, places, _, path, _| {
-        drawn.add(&table.frame, places, path)
+    let read = over(paths, options, PieceSize::default(), &mut |table, places, _, _| {
+        drawn.add(&table.frame, places, &table.path())?;
+        Ok(true)
     })?;
     read.drawn(drawn)
 }
@@ -173,47 +173,74 @@ impl Read {
     }
 }
 
-/// What is done with a piece: its rows that the filter keeps, their places among all rows, what was read, the file, and the
-/// options.
-type Each<'a> = &'a mut dyn FnMut(&mut Table, &[usize], &Read, &Path, &TableOptions) -> Result<(), PairsError>;
+/// What is done with a piece: its rows that the filter keeps, their places among all rows, what was read, and what is known
+/// of the columns; whether to go on. Rows in errors are counted from the start of the piece.
+type Each<'a> = &'a mut dyn FnMut(&mut Table, &[usize], &Read, &mut Alike) -> Result<bool, PairsError>;
 
 /// Reads all files piece by piece.
 fn over(paths: &[PathBuf], options: &TableOptions, size: PieceSize, each: Each<'_>) -> Result<Read, PairsError> {
-    let mut read = Read::default();
+    let (mut read, mut alike, mut more) = (Read::default(), Alike::default(), true);
     for (i, path) in paths.iter().enumerate() {
         caught(path, |file| {
             if i == 0 {
                 read.options = expanded(file, path, options)?;
             }
-            let expanded = read.options.clone();
-            let mut add = |piece: &dyn TableFile| -> Result<(), PairsError> {
-                let frame = several::read(piece, path, &expanded).map_err(|error| moved(error, read.rows))?;
-                (read.before, read.rows) = (read.rows, read.rows + frame.height() as u64);
-                if read.rows > u64::from(u32::MAX) {
-                    return Err(PairsError::TooManyRows);
-                }
-                let mut table = Table::of(frame, path);
-                if let Some(predicate) = &expanded.filter {
-                    match rows::keep(&mut table, predicate) {
-                        Err(PairsError::NothingKept { .. }) => return Ok(()),
-                        other => other?,
-                    }
-                }
-                let height = table.frame.height();
-                read.kept += height as u64;
-                let places: Vec<usize> = (0..height).map(|at| read.before as usize + table.place(at).0 - 1).collect();
-                let mut table = Table::of(table.frame, path);
-                if height == 0 { Ok(()) } else { each(&mut table, &places, &read, path, &expanded) }
+            let start = read.rows;
+            let mut add = |piece: &dyn TableFile| -> Result<bool, PairsError> {
+                let before = read.rows - start;
+                let more = next(piece, path, &mut read, &mut alike, each);
+                more.map_err(|error| moved(error, before))
             };
-            match file.pieces(size)? {
-                Some(pieces) => pieces.into_iter().try_for_each(|piece| add(&*piece?))?,
-                None => add(file)?,
+            let mut any = false;
+            for piece in file.pieces(size)?.into_iter().flatten() {
+                any = true;
+                more = add(&*piece?)?;
+                if !more {
+                    break;
+                }
+            }
+            // it cannot be cut, or has no row
+            if !any {
+                more = add(file)?;
             }
             Ok(())
         })?;
         read.files.push((path.clone(), read.rows as usize));
+        if !more {
+            break;
+        }
     }
     Ok(read)
+}
+
+/// Reads a piece, and says whether to go on.
+fn next(
+    piece: &dyn TableFile,
+    path: &Path,
+    read: &mut Read,
+    alike: &mut Alike,
+    each: Each<'_>,
+) -> Result<bool, PairsError> {
+    let frame = several::read(piece, path, &read.options)?;
+    (read.before, read.rows) = (read.rows, read.rows + frame.height() as u64);
+    if read.rows > u64::from(u32::MAX) {
+        return Err(PairsError::TooManyRows);
+    }
+    if frame.height() == 0 {
+        return Ok(true);
+    }
+    alike.check(&frame, &read.options, path)?;
+    let mut table = Table::of(frame, path);
+    if let Some(predicate) = &read.options.filter {
+        match rows::keep(&mut table, predicate) {
+            Err(PairsError::NothingKept { .. }) => return Ok(true),
+            other => other?,
+        }
+    }
+    let height = table.frame.height();
+    read.kept += height as u64;
+    let places: Vec<usize> = (0..height).map(|at| read.before as usize + table.place(at).0 - 1).collect();
+    each(&mut table, &places, read, alike)
 }
 
 /// Rows of all files, if every one of them says it.
@@ -222,101 +249,24 @@ fn rows_of(paths: &[PathBuf]) -> Result<Option<u64>, PairsError> {
     each.collect::<Result<Vec<_>, _>>().map(|all| all.into_iter().sum())
 }
 
-/// The error, with its row counted from the start of the table.
+/// The error, with its row counted from the start of the file.
 fn moved(mut error: PairsError, before: u64) -> PairsError {
-    if let PairsError::Infinite { row, .. } | PairsError::Ragged { row, .. } | PairsError::Stray { row, .. } =
-        &mut error
+    if let PairsError::Infinite { row, .. }
+    | PairsError::Ragged { row, .. }
+    | PairsError::Stray { row, .. }
+    | PairsError::Far { row, .. }
+    | PairsError::Mixed { row, .. } = &mut error
     {
         *row += before as usize;
     }
     error
 }
 
-/// The numbers of words, the same in all pieces, and which columns hold words or dates.
-#[derive(Default)]
-struct Words {
-    columns: BTreeMap<String, Kind>,
-    dates: std::collections::BTreeSet<String>,
-}
-
-enum Kind {
-    Numbers,
-    Words(BTreeMap<String, u32>),
-}
-
-impl Words {
-    /// Puts numbers in place of words and dates. `before` rows stand before the piece.
-    fn number(
-        &mut self,
-        table: &mut Table,
-        options: &TableOptions,
-        before: u64,
-        path: &Path,
-    ) -> Result<(), PairsError> {
-        for name in options.x.iter().chain(&options.y).chain(&options.given) {
-            let column = table.column(name)?.clone();
-            let kind = column.dtype().clone();
-            let fail = || unreadable("table", path);
-            let numbers = if column.null_count() == column.len() {
-                // nothing in it: not even a kind
-                Series::full_null(name.as_str().into(), column.len(), &DataType::Float64).into()
-            } else if Holds::of(&kind) == Holds::Words {
-                let texts = column.cast(&DataType::String).map_err(fail())?;
-                self.numbered(name, &texts, before, path)?
-            } else {
-                if let Kind::Words(_) = self.columns.entry(name.clone()).or_insert(Kind::Numbers) {
-                    return Err(PairsError::Mixed { name: name.clone(), row: before + 1, path: path.to_owned() });
-                }
-                match Holds::of(&kind) {
-                    Holds::Dates => {
-                        self.dates.insert(name.clone());
-                        let ticks = column.to_physical_repr().cast(&DataType::Float64).map_err(fail())?;
-                        let ticks = ticks.f64().map_err(fail())?;
-                        let each = per_second(&kind);
-                        let seconds: Vec<Option<f64>> = ticks.iter().map(|v| v.map(|v| v / each)).collect();
-                        Series::new(name.as_str().into(), seconds).into()
-                    }
-                    Holds::Numbers if kind.is_integer() => column.cast(&DataType::Float64).map_err(fail())?,
-                    _ => continue,
-                }
-            };
-            table.frame.with_column(numbers).map_err(fail())?;
-        }
-        Ok(())
-    }
-
-    fn numbered(&mut self, name: &str, texts: &Column, before: u64, path: &Path) -> Result<Column, PairsError> {
-        let entry = self.columns.entry(name.to_owned()).or_insert_with(|| Kind::Words(BTreeMap::new()));
-        let Kind::Words(known) = entry else {
-            return Err(PairsError::Mixed { name: name.to_owned(), row: before + 1, path: path.to_owned() });
-        };
-        let texts = texts.str().map_err(unreadable("table", path))?;
-        let mut number = |text: &str| {
-            let next = known.len() as u32;
-            known.get(text).copied().unwrap_or_else(|| {
-                known.insert(text.to_owned(), next);
-                next
-            })
-        };
-        let numbers: Vec<Option<u32>> = texts.iter().map(|text| text.map(&mut number)).collect();
-        Ok(Series::new(name.into(), numbers).into())
-    }
-
-    /// Says which columns of the samples stand for words.
-    fn mark(&self, samples: &mut Samples) {
-        for columns in [Some(&mut samples.x), Some(&mut samples.y), samples.z.as_mut()].into_iter().flatten() {
-            let columns = Arc::make_mut(columns);
-            columns.words =
-                columns.names.iter().map(|name| matches!(self.columns.get(name), Some(Kind::Words(_)))).collect();
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use std::fmt::Write as _;
 
-    use polars::prelude::{ParquetWriter, SerReader as _};
+    use polars::prelude::{NamedFrom as _, ParquetWriter, SerReader as _, Series};
     use proptest::prelude::*;
 
     use super::*;
@@ -360,6 +310,7 @@ mod tests {
                 let z = piece.z.as_ref().map_or(0.0, |z| z.row(r)[0]);
                 [piece.x.row(r)[0], piece.y.row(r)[0], z]
             }));
+            true
         });
         (all, words, passed.unwrap())
     }
@@ -394,6 +345,174 @@ mod tests {
         }
     }
 
+    /// Two files with dates, integers beyond what a float holds, words, and columns that have no value at first.
+    fn files(seed: u64) -> (tempfile::TempDir, [PathBuf; 2]) {
+        let mut rng = Seeds::new(seed).stream("files");
+        let dir = tempfile::tempdir().unwrap();
+        let paths = ["1.csv", "2.csv"].map(|name| dir.path().join(name));
+        for (path, rows) in paths.iter().zip([40_u64, 25]) {
+            let mut text = "\nd,i,w,late,n\n".to_owned();
+            for row in 0..rows {
+                let day = 1 + rng::below(&mut rng, 28);
+                let large = (1_u64 << 60) + rng::below(&mut rng, 1000) as u64;
+                let word = ["red", "green", ""][rng::below(&mut rng, 3)];
+                let late = if row < 20 { "" } else { ["a", "b"][rng::below(&mut rng, 2)] };
+                let number = if row % 3 == 0 { "1.5".to_owned() } else { row.to_string() };
+                writeln!(text, "2024-01-{day:02}T00:00:00.25,{large},{word},{late},{number}").unwrap();
+            }
+            crate::io::write_atomic(path, text.as_bytes()).unwrap();
+        }
+        (dir, paths)
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig { cases: 24, ..ProptestConfig::default() })]
+        #[test]
+        fn pieces_of_several_files_are_the_table_in_memory(
+            seed in 0_u64..1000,
+            bytes in 1_usize..600,
+            filter in prop::sample::select(vec![
+                "", "w = 'red'", "d >= '2024-01-10'", "late IS NULL OR late = 'a'", "n > 1 AND w <> 'green'",
+            ]),
+        ) {
+            let (_dir, paths) = files(seed);
+            let filter = (!filter.is_empty()).then(|| crate::pairs::Predicate::parse(filter).unwrap());
+            for (x, y) in [("d", "i"), ("n", "d"), ("i", "n"), ("w", "i"), ("late", "w")] {
+                let options = TableOptions { filter: filter.clone(), ..of(x, y, &[]) };
+                let whole = crate::pairs::tables(&paths, &options).unwrap().0.remove(0);
+                let mut found: [Vec<f64>; 2] = Default::default();
+                let passed = pass(&paths, &options, PieceSize { rows: 1, bytes }, &mut |piece, _| {
+                    found[0].extend((0..piece.len()).map(|r| piece.x.row(r)[0]));
+                    found[1].extend((0..piece.len()).map(|r| piece.y.row(r)[0]));
+                    true
+                })
+                .unwrap();
+                prop_assert_eq!((passed.rows, passed.used), (65, whole.len() as u64));
+                for (found, expected) in found.iter().zip([&whole.x, &whole.y]) {
+                    if expected.is_words(0) {
+                        // numbers of words: one each
+                        let pairs: std::collections::BTreeSet<(u64, u64)> =
+                            found.iter().zip(&expected.data).map(|(a, b)| (a.to_bits(), b.to_bits())).collect();
+                        let words: std::collections::BTreeSet<u64> = expected.data.iter().map(|v| v.to_bits()).collect();
+                        prop_assert_eq!(pairs.len(), words.len());
+                    } else {
+                        // counted from elsewhere, the same in all pieces
+                        let moved = found[0] - expected.data[0];
+                        for (a, b) in found.iter().zip(&expected.data) {
+                            prop_assert!((a - b - moved).abs() < 1e-9, "{} {} {}", a, b, moved);
+                        }
+                    }
+                }
+                // a sample of all rows is the table
+                let all = TableOptions { sample: Some(Sample { rows: 1000, seeds: Seeds::new(1) }), ..options.clone() };
+                prop_assert_eq!(crate::pairs::tables(&paths, &all).unwrap().0.remove(0), whole);
+            }
+        }
+    }
+
+    #[test]
+    fn a_sample_takes_pieces_of_the_types_of_their_columns_whole() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("t.csv");
+        let text = format!("a,b\n{}{}", "1,\n".repeat(30), "2.5,x\n".repeat(30));
+        crate::io::write_atomic(&path, text.as_bytes()).unwrap();
+        let options = TableOptions { sample: Some(Sample { rows: 1000, seeds: Seeds::new(1) }), ..of("a", "b", &[]) };
+        let size = PieceSize { rows: 1, bytes: 20 };
+        let passed = pass(&[path], &options, size, &mut |_, _| true).unwrap();
+        assert_eq!(passed.sample.x.data, [2.5; 30]);
+        assert_eq!((passed.sample.y.is_words(0), passed.used), (true, 30));
+    }
+
+    #[test]
+    fn columns_hold_one_thing_in_all_pieces_and_files() {
+        let dir = tempfile::tempdir().unwrap();
+        let paths = ["1.csv", "2.csv"].map(|name| dir.path().join(name));
+        let fails = |first: &str, second: &str| {
+            crate::io::write_atomic(&paths[0], format!("a,b\n{first}").as_bytes()).unwrap();
+            crate::io::write_atomic(&paths[1], format!("a,b\n{second}").as_bytes()).unwrap();
+            let size = PieceSize { rows: 1, bytes: 8 };
+            let error = pass(&paths, &of("a", "b", &[]), size, &mut |_, _| true).unwrap_err().to_string();
+            let sample = Some(Sample { rows: 9, seeds: Seeds::new(1) });
+            let options = TableOptions { sample, ..of("a", "b", &[]) };
+            assert_eq!(drawn_in(&paths, &options, size).unwrap_err().to_string(), error);
+            (error, crate::pairs::tables(&paths, &of("a", "b", &[])).unwrap_err().to_string())
+        };
+        for (first, second) in [("x,1\ny,2\n", "1,1\n2,2\n"), ("1,1\n", "true,1\n"), ("2024-01-01,1\n", "7,2\n")] {
+            let (found, expected) = fails(first, second);
+            assert_eq!(found, expected);
+            assert!(found.contains(" holds ") && found.contains("takes both as words"), "{found}");
+        }
+        let (found, _) = fails("2024-01-01,1\n2024-01-02,1\n17,3\n", "1,1\n");
+        let expected =
+            "column \"a\" holds both dates and numbers, seen from row 3 on: a large or sampled table is read in pieces";
+        assert!(found.starts_with(expected), "{found}");
+        // rows are those of the file, also behind a filter
+        crate::io::write_atomic(&paths[0], b"a,b\n1,1\n2,2\n").unwrap();
+        crate::io::write_atomic(&paths[1], b"a,b\n1,1\n1,2\n1e200,3\n").unwrap();
+        let filter = Some(crate::pairs::Predicate::parse("b > 1").unwrap());
+        let options = TableOptions { filter, ..of("a", "b", &[]) };
+        let error = pass(&paths, &options, PieceSize { rows: 1, bytes: 8 }, &mut |_, _| true).unwrap_err().to_string();
+        assert!(error.starts_with("column \"a\", row 3: infinite") && error.ends_with("2.csv"), "{error}");
+    }
+
+    /// What [`drawn`] gives of pieces of this size.
+    fn drawn_in(paths: &[PathBuf], options: &TableOptions, size: PieceSize) -> Result<(), PairsError> {
+        let mut drawn = Drawn::new(options.sample.as_ref().unwrap());
+        over(paths, options, size, &mut |table, places, _, _| {
+            drawn.add(&table.frame, places, &table.path()).map(|()| true)
+        })
+        .map(drop)
+    }
+
+    #[test]
+    fn vectors_have_one_length_in_all_pieces() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("t.parquet");
+        let vector = |length: usize| Series::new("".into(), vec![1.0; length]);
+        let vectors: Vec<Series> = [2, 2, 3].map(vector).to_vec();
+        let columns = vec![
+            polars::prelude::Column::from(Series::new("v".into(), vectors)),
+            polars::prelude::Column::from(Series::new("b".into(), [1.0, 2.0, 3.0])),
+        ];
+        let mut frame = polars::prelude::DataFrame::new(3, columns).unwrap();
+        ParquetWriter::new(std::fs::File::create(&path).unwrap()).finish(&mut frame).unwrap();
+        for rows in [1, 2, 3] {
+            let size = PieceSize { rows, bytes: 1 };
+            let error = pass(std::slice::from_ref(&path), &of("v", "b", &[]), size, &mut |_, _| true).unwrap_err();
+            let error = error.to_string();
+            assert!(error.starts_with("column \"v\", row 3: expected a vector of 2 numbers, found 3"), "{error}");
+        }
+    }
+
+    #[test]
+    fn who_wants_no_more_reads_no_more_and_a_condition_is_over_all_pieces() {
+        let (_dir, paths) = files(1);
+        let mut seen = 0;
+        let size = PieceSize { rows: 1, bytes: 100 };
+        let passed = pass(&paths, &of("d", "i", &[]), size, &mut |_, _| {
+            seen += 1;
+            seen < 2
+        })
+        .unwrap();
+        assert!(seen == 2 && passed.rows < 20, "{passed:?}");
+        let sample = Some(Sample { rows: 1000, seeds: Seeds::new(1) });
+        let options = TableOptions { sample, ..of("d", "i", &[]) };
+        let passed = pass(&paths, &options, size, &mut |_, _| false).unwrap();
+        assert_eq!((passed.rows, passed.sample.len()), (65, 65));
+        for (text, message) in [
+            ("n > 1000", "no rows: --where \"n > 1000\" keeps none of the 65 rows"),
+            ("late = 'zz'", "no rows: --where \"late = 'zz'\" keeps none of the 65 rows"),
+        ] {
+            let filter = Some(crate::pairs::Predicate::parse(text).unwrap());
+            let options = TableOptions { filter, ..of("d", "i", &[]) };
+            let error = pass(&paths, &options, size, &mut |_, _| true).unwrap_err().to_string();
+            assert!(error.starts_with(message), "{error}");
+        }
+        crate::io::write_atomic(&paths[0], b"d,x\n").unwrap();
+        let missing = pass(&paths[..1], &of("d", "i", &[]), size, &mut |_, _| true).unwrap_err().to_string();
+        assert!(missing.starts_with("no column \"i\""), "{missing}");
+    }
+
     #[test]
     fn a_sample_is_drawn_beside_the_pass_and_is_the_one_that_the_table_draws_alone() {
         let (_dir, paths) = tables(200, 1);
@@ -419,9 +538,8 @@ mod tests {
         let path = dir.path().join("t.csv");
         let fails = |text: &str| {
             crate::io::write_atomic(&path, text.as_bytes()).unwrap();
-            let error =
-                pass(std::slice::from_ref(&path), &of("a", "b", &[]), PieceSize { rows: 1, bytes: 40 }, &mut |_, _| ())
-                    .unwrap_err();
+            let error = pass(&[path.clone()], &of("a", "b", &[]), PieceSize { rows: 1, bytes: 40 }, &mut |_, _| true)
+                .unwrap_err();
             error.to_string()
         };
         let lines = |n: usize, line: &str| format!("{line}\n").repeat(n);
@@ -430,7 +548,7 @@ mod tests {
         let mixed = fails(&format!("a,b\n{}{}", lines(50, "1,2"), lines(50, "x,2")));
         assert!(mixed.starts_with("column \"a\" holds both numbers and words, seen from row "), "{mixed}");
         let mixed = fails(&format!("a,b\n{}{}", lines(49, "x,2"), lines(50, "1,2")));
-        assert!(mixed.starts_with("column \"a\" holds both numbers and words, seen from row "), "{mixed}");
+        assert!(mixed.starts_with("column \"a\" holds both words and numbers, seen from row "), "{mixed}");
         // in the middle of a piece it is a stray cell
         let stray = fails(&format!("a,b\n{}{}", lines(50, "x,2"), lines(50, "1,2")));
         assert!(

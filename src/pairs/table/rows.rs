@@ -89,6 +89,8 @@ enum Cells {
     Words(StringChunked),
     /// Ticks, and nanoseconds in each.
     Instants(Int64Chunked, i128),
+    /// No value at all: a piece of a column need not say what the others hold.
+    Empty,
 }
 
 impl Cells {
@@ -101,6 +103,9 @@ impl Cells {
         };
         let integers = || Ok::<_, PairsError>(cast(&DataType::Int64)?.i64().ok().ok_or_else(unfit)?.clone());
         let floats = || Ok::<_, PairsError>(cast(&DataType::Float64)?.f64().ok().ok_or_else(unfit)?.clone());
+        if column.null_count() == column.len() {
+            return Ok(Self::Empty);
+        }
         Ok(match Holds::of(&kind) {
             Holds::Numbers if kind.is_bool() => Self::Truths(column.bool().ok().ok_or_else(unfit)?.clone()),
             Holds::Numbers if kind.is_integer() && integers()?.null_count() == column.null_count() => {
@@ -123,6 +128,7 @@ impl Cells {
             Self::Truths(_) => Kind::Truth,
             Self::Words(_) => Kind::Text,
             Self::Instants(..) => Kind::Instant,
+            Self::Empty => Kind::Null,
         }
     }
 
@@ -133,6 +139,7 @@ impl Cells {
             Self::Truths(cells) => cells.get(row).map(Value::Truth),
             Self::Words(cells) => cells.get(row).map(Value::Text),
             Self::Instants(cells, each) => cells.get(row).map(|v| Value::Instant(i128::from(v) * each)),
+            Self::Empty => None,
         };
         value.unwrap_or(Value::Null)
     }

@@ -80,7 +80,7 @@ impl Drawn {
 }
 
 fn filtered(rows: &DataFrame, mask: &[bool], path: &Path) -> Result<DataFrame, PairsError> {
-    rows.filter(&BooleanChunked::from_slice("".into(), mask)).map_err(unreadable("table", path))
+    rows.filter(&BooleanChunked::from_slice("".into(), mask)).map_err(unreadable("data", path))
 }
 
 #[cfg(test)]

@@ -61,7 +61,7 @@ impl Table {
     }
 
     pub(super) fn column(&self, name: &str) -> Result<&Column, PairsError> {
-        self.frame.column(name).map_err(unreadable("table", &self.path()))
+        self.frame.column(name).map_err(unreadable("data", &self.path()))
     }
 
     /// The first file.
@@ -86,7 +86,7 @@ impl Table {
     pub(super) fn keep(&mut self, wanted: &[bool], note: String) -> Result<(), PairsError> {
         self.notes.push(note);
         let mask = BooleanChunked::from_slice("".into(), wanted);
-        self.frame = self.frame.filter(&mask).map_err(unreadable("table", &self.path()))?;
+        self.frame = self.frame.filter(&mask).map_err(unreadable("data", &self.path()))?;
         self.kept = Some((0..wanted.len()).filter(|&at| wanted[at]).collect());
         Ok(())
     }
@@ -94,7 +94,7 @@ impl Table {
     /// Puts the rows of another file behind; a column of both must hold the same in both.
     pub(super) fn append(&mut self, mut frame: DataFrame, path: &Path) -> Result<(), PairsError> {
         let first = self.path();
-        let fail = || unreadable("table", path);
+        let fail = || unreadable("data", path);
         let columns: Vec<String> = self.frame.get_column_names().into_iter().map(ToString::to_string).collect();
         for name in &columns {
             let (mine, other) = (self.column(name)?, frame.column(name).map_err(fail())?);
@@ -176,7 +176,7 @@ pub(super) fn read(file: &dyn TableFile, path: &Path, options: &TableOptions) ->
         let hint = "write it as float64, an integer or text".to_owned();
         return Err(PairsError::NotNumeric { name, kind, hint, path: path.to_owned() });
     }
-    let fail = || unreadable("table", path);
+    let fail = || unreadable("data", path);
     // a file's name alone is no column of it: something must say how many rows there are
     let counted = if columns.is_empty() { known.first().map(String::as_str) } else { None };
     columns.extend(counted);

@@ -7,13 +7,10 @@ use polars::io::mmap::MmapBytesReader;
 use polars::prelude::{CsvReadOptions, DataFrame, SerReader as _};
 
 use super::form::{PieceSize, Pieces, TableFile, open, unreadable};
-use super::lines::Lines;
+use super::lines::{LINE, Lines};
 use crate::io::IoError;
 use crate::pairs::PairsError;
 use crate::storage::TableForm;
-
-/// Longest line, bytes.
-const LINE_LIMIT: usize = 16 << 20;
 
 /// Lines of text, none of which is absurdly long.
 pub(super) struct Text {
@@ -116,27 +113,27 @@ impl TableFile for Piece<'_> {
 /// How zip archives (spreadsheets, .npz) and gzip files begin.
 const PACKED: [&[u8]; 2] = [b"PK\x03\x04", b"\x1f\x8b"];
 
-/// Refuses what is packed, and a line that is longer than [`LINE_LIMIT`]: no table has one, and the reader would hold it
-/// in memory.
+/// Refuses what is packed, and a line that is longer than [`LINE`]: no table has one, and the reader would hold it in
+/// memory. A line end within quotes ends no line, as for [`Lines`].
 fn check_lines(path: &Path, form: TableForm) -> Result<(), PairsError> {
     let (mut file, mut block) = (open(path)?, vec![0; 1 << 18]);
-    let (mut line, mut length) = (1_u64, 0);
+    let (mut line, mut length, mut quoted) = (1_u64, 0, false);
     loop {
         let read = file.read(&mut block).map_err(IoError::os("read", path))?;
         if line == 1 && PACKED.iter().any(|magic| block[..read].starts_with(magic)) {
             let message = "it is packed (zip, gzip, .npz, a spreadsheet): unpack it, or save it as a table".to_owned();
             return Err(PairsError::Unreadable { form: form.name(), message, path: path.to_owned() });
         }
-        let mut pieces = block[..read].split(|&byte| byte == b'\n');
-        length += pieces.next().map_or(0, <[u8]>::len);
-        for piece in pieces {
-            if length > LINE_LIMIT {
-                break;
+        for &byte in &block[..read] {
+            quoted ^= byte == b'"';
+            if byte == b'\n' && !quoted {
+                (line, length) = (line + 1, 0);
+            } else {
+                length += 1;
             }
-            (line, length) = (line + 1, piece.len());
-        }
-        if length > LINE_LIMIT {
-            return Err(PairsError::LongLine { line, limit: LINE_LIMIT, path: path.to_owned() });
+            if length > LINE {
+                return Err(PairsError::LongLine { line, limit: LINE, path: path.to_owned() });
+            }
         }
         if read == 0 {
             return Ok(());
