@@ -134,7 +134,9 @@ impl OnePass for DiscretePass {
         let mut rows = counted.rows(labels, local, p, notes);
         if p.is_none() {
             // nothing says that there is dependence at all
-            rows.iter_mut().for_each(|row| row.interval_low = row.interval_low.map(|low| low.min(0.0)));
+            for row in &mut rows {
+                row.interval_low = row.interval_low.map(|low| low.min(0.0));
+            }
         }
         Ok(rows)
     }

@@ -538,7 +538,10 @@ mod tests {
         let path = dir.path().join("t.csv");
         let fails = |text: &str| {
             crate::io::write_atomic(&path, text.as_bytes()).unwrap();
-            let error = pass(&[path.clone()], &of("a", "b", &[]), PieceSize { rows: 1, bytes: 40 }, &mut |_, _| true)
+            let error =
+                pass(std::slice::from_ref(&path), &of("a", "b", &[]), PieceSize { rows: 1, bytes: 40 }, &mut |_, _| {
+                    true
+                })
                 .unwrap_err();
             error.to_string()
         };
