@@ -353,6 +353,7 @@ fn options(args: &Args) -> Result<TableOptions, Error> {
         filter: args.filter.as_deref().map(Predicate::parse).transpose()?,
         sample: args.sample.map(|rows| pairs::Sample { rows: rows as usize, seeds: sample_seeds(args) }),
         by: args.by.clone(),
+        lags: args.lag.to_vec(),
     })
 }
 
@@ -362,7 +363,11 @@ fn samples(args: &Args) -> Result<Vec<Samples>, Error> {
             "--lag needs neighbouring rows, which --sample takes apart: leave out one".to_owned(),
         ));
     }
-    let (sets, by) = unlagged(args)?;
+    let paths = pairs::matching(&args.paths)?;
+    if !args.x.is_empty() || args.all_pairs {
+        return of_table(args, &paths, &options(args)?);
+    }
+    let (sets, by) = of_store(args, &paths)?;
     let (mut out, mut short, mut lagging) = (Vec::new(), Vec::new(), Lagging::default());
     let mut lagged = |set: &Samples, lag: usize| match lagging.lagged(set, lag) {
         Ok(samples) => Some(samples),
@@ -407,12 +412,8 @@ fn of_table(args: &Args, paths: &[PathBuf], options: &TableOptions) -> Result<Ve
     Ok(sets)
 }
 
-/// The samples without a lag; and how links are to be pooled, if they are.
-fn unlagged(args: &Args) -> Result<(Vec<Samples>, Option<By>), Error> {
-    let paths = pairs::matching(&args.paths)?;
-    if !args.x.is_empty() || args.all_pairs {
-        return Ok((of_table(args, &paths, &options(args)?)?, None));
-    }
+/// The links of a store without a lag; and how they are to be pooled, if they are.
+fn of_store(args: &Args, paths: &[PathBuf]) -> Result<(Vec<Samples>, Option<By>), Error> {
     let filter = args.filter.as_deref().map(Predicate::parse).transpose()?;
     let path = &paths[0];
     if paths.len() > 1 {

@@ -57,6 +57,18 @@ pub enum PairsError {
         /// What to do.
         remedy: &'static str,
     },
+    /// No two rows so far apart have all values.
+    #[error("no pair {lag} rows apart: all {pairs} have a missing value in {columns}: {}", path.display())]
+    NoPairsApart {
+        /// Rows between x and y.
+        lag: usize,
+        /// Pairs of rows.
+        pairs: usize,
+        /// Columns asked for.
+        columns: String,
+        /// File.
+        path: PathBuf,
+    },
     /// A pattern that is none, or that no column matches.
     #[error("{pattern:?}: {message}: {}", path.display())]
     Pattern {

@@ -58,9 +58,16 @@ pub struct TableOptions {
     pub sample: Option<Sample>,
     /// Columns of whose every value there is a set of samples of its own.
     pub by: Vec<String>,
+    /// Rows from x (and z) to y, each a set of samples of its own; none: 0. They count all rows of an episode in its order,
+    /// whether those have values and the filter keeps them or not.
+    pub lags: Vec<usize>,
 }
 
 impl TableOptions {
+    fn lags(&self) -> &[usize] {
+        if self.lags.is_empty() { &[0] } else { &self.lags }
+    }
+
     /// All columns that are named.
     fn wanted(&self) -> Vec<&str> {
         let keys = self.group.iter().chain(&self.by).map(String::as_str);
@@ -95,7 +102,7 @@ pub fn is_store(path: &Path) -> Result<bool, PairsError> {
 /// # Errors
 /// [`PairsError`] that names column and row.
 pub fn table(path: &Path, options: &TableOptions) -> Result<Samples, PairsError> {
-    let mut sets = tables(&[path.to_owned()], &TableOptions { by: Vec::new(), ..options.clone() })?.0;
+    let mut sets = tables(&[path.to_owned()], &TableOptions { by: Vec::new(), lags: Vec::new(), ..options.clone() })?.0;
     sets.pop().ok_or_else(|| PairsError::NoFiles("no file was named".to_owned()))
 }
 
@@ -111,11 +118,13 @@ pub fn tables(paths: &[PathBuf], options: &TableOptions) -> Result<(Vec<Samples>
         let (mut sets, mut left_out) = (Vec::new(), Vec::new());
         let mut last = None;
         for part in rows::parts(&table, &options.by)? {
-            match chosen.samples(&part) {
-                Ok(set) => sets.push(set),
-                Err(error) => {
-                    left_out.push(format!("{}: {error}", part.within.as_deref().unwrap_or("all rows")));
-                    last = Some(error);
+            for set in chosen.at_lags(&part) {
+                match set {
+                    Ok(set) => sets.push(set),
+                    Err(error) => {
+                        left_out.push(format!("{}: {error}", part.within.as_deref().unwrap_or("all rows")));
+                        last = Some(error);
+                    }
                 }
             }
         }
@@ -153,7 +162,7 @@ pub fn all_pairs(paths: &[PathBuf], options: &TableOptions) -> Result<(Vec<Sampl
         }
         let parts = rows::parts(&table, &options.by)?;
         let rows = table.frame.height();
-        let is_empty = |name: &String| table.frame.column(name).is_ok_and(|c| c.null_count() == rows);
+        let is_empty = |name: &String| table.values(name).is_ok_and(|c| c.null_count() == rows);
         let (empty, full): (Vec<String>, Vec<String>) = columns.into_iter().partition(is_empty);
         let (mut sets, mut last) = (Vec::new(), None);
         left_out.extend(empty.iter().map(|name| format!("column {name:?} is empty")));
@@ -161,8 +170,10 @@ pub fn all_pairs(paths: &[PathBuf], options: &TableOptions) -> Result<(Vec<Sampl
             let (x, y) = (vec![full[i].clone()], vec![full[j].clone()]);
             let options = TableOptions { x, y, ..options.clone() };
             let chosen = Chosen::of(&table, &options)?;
-            for part in &parts {
-                match chosen.samples(part) {
+            for (part, set) in
+                parts.iter().flat_map(|part| chosen.at_lags(part).into_iter().map(move |set| (part, set)))
+            {
+                match set {
                     Ok(set) => sets.push(set),
                     Err(error) => {
                         let within = part.within.as_ref().map(|within| format!("{within}: ")).unwrap_or_default();
@@ -193,7 +204,8 @@ fn filtered(paths: &[PathBuf], options: &TableOptions) -> Result<(Table, TableOp
         return Err(PairsError::EmptyTable(table.path()));
     }
     if let Some(predicate) = &options.filter {
-        rows::keep(&mut table, predicate)?;
+        let leave_out = if options.lags().iter().any(|&lag| lag > 0) { rows::mark } else { rows::keep };
+        leave_out(&mut table, predicate)?;
     }
     Ok((table, options))
 }

@@ -56,7 +56,7 @@ pub(super) fn notes(table: &Table, names: &[&str]) -> Result<Vec<String>, PairsE
         match Holds::of(table.column(name)?.dtype()) {
             Holds::Dates => out.push(format!("dates of {name} are seconds since the first of them")),
             Holds::Times => out.push(format!("times of {name} are seconds")),
-            Holds::Numbers if shift(table.column(name)?).is_some() => {
+            Holds::Numbers if shift(&table.values(name)?).is_some() => {
                 out.push(format!("integers of {name} are counted from the least of them: they do not fit a float"));
             }
             _ => {}
@@ -102,7 +102,7 @@ pub(super) fn numbers(table: &Table, names: &[String]) -> Result<Columns, PairsE
     let mut parts: Vec<(usize, Vec<f64>)> = Vec::new();
     let mut out = Columns::default();
     for name in names {
-        let column = table.column(name)?;
+        let column = &table.values(name)?;
         let words = ranks(column);
         let is_words = words.is_some();
         let (width, values) = words.map_or_else(|| flat(table, column), |words| Ok((1, words)))?;

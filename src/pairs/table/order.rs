@@ -88,6 +88,23 @@ impl Order {
         }
     }
 
+    /// Whether all steps from row to row within the episodes are equal, but for rounding.
+    pub(super) fn is_even(&self, rows: &[usize], starts: &[usize]) -> bool {
+        let mut steps = (1..rows.len()).filter(|at| starts.binary_search(at).is_err());
+        match self {
+            Self::Integers(values) => {
+                let step = |at: usize| Some(i128::from(values[rows[at]]?) - i128::from(values[rows[at - 1]]?));
+                let first = steps.next().and_then(step);
+                steps.all(|at| step(at) == first)
+            }
+            Self::Floats(values) => {
+                let step = |at: usize| values[rows[at]] - values[rows[at - 1]];
+                let first = steps.next().map_or(0.0, step);
+                steps.all(|at| (step(at) - first).abs() <= 1e-6 * first + 1e-15 * values[rows[at]].abs())
+            }
+        }
+    }
+
     /// How many of the ordered rows stand at the same time as the row before them in their episode.
     pub(super) fn ties(&self, rows: &[usize], starts: &[usize], one_series: bool) -> usize {
         let same = |at: usize| self.compare(rows[at - 1], rows[at]) == Ordering::Equal;

@@ -32,8 +32,10 @@ pub(super) fn parts(table: &Table, by: &[String]) -> Result<Vec<Part>, PairsErro
     let columns = by.iter().map(|name| texts(table, name)).collect::<Result<Vec<_>, _>>()?;
     let mut found: BTreeMap<Vec<&str>, Vec<usize>> = BTreeMap::new();
     let mut missing = 0;
-    for row in 0..height {
-        match columns.iter().map(|column| column[row].as_deref()).collect::<Option<Vec<_>>>() {
+    let values = |row: usize| columns.iter().map(|column| column[row].as_deref()).collect::<Option<Vec<_>>>();
+    let is_wanted = |row: usize| table.wanted().is_none_or(|wanted| wanted[row]);
+    for row in (0..height).filter(|&row| is_wanted(row)) {
+        match values(row) {
             Some(values) => found.entry(values).or_default().push(row),
             None => missing += 1,
         }
@@ -44,6 +46,14 @@ pub(super) fn parts(table: &Table, by: &[String]) -> Result<Vec<Part>, PairsErro
     if found.is_empty() {
         return Err(PairsError::NoRows { rows: height, columns: by.join(", "), path: table.path() });
     }
+    // rows that are not wanted only have their places
+    for row in (0..height).filter(|&row| !is_wanted(row)) {
+        if let Some(rows) = values(row).and_then(|values| found.get_mut(&values)) {
+            rows.push(row);
+        }
+    }
+    found.values_mut().for_each(|rows| rows.sort_unstable());
+    let height = (0..height).filter(|&row| is_wanted(row)).count();
     let note = (missing > 0)
         .then(|| format!("{NOTE}{missing} of {height} rows are in no part: a missing value in {}", by.join(", ")));
     let mut parts: Vec<(Vec<&str>, Vec<usize>)> = found.into_iter().collect();
@@ -65,6 +75,19 @@ pub(super) fn parts(table: &Table, by: &[String]) -> Result<Vec<Part>, PairsErro
 
 /// Leaves out the rows that a predicate does not keep, and says how many are left.
 pub(super) fn keep(table: &mut Table, predicate: &Predicate) -> Result<(), PairsError> {
+    let (wanted, note) = wanted(table, predicate)?;
+    table.keep(&wanted, note)
+}
+
+/// The same, but the rows stay in their places, for a lag to count them.
+pub(super) fn mark(table: &mut Table, predicate: &Predicate) -> Result<(), PairsError> {
+    let (wanted, note) = wanted(table, predicate)?;
+    table.mark(wanted, note);
+    Ok(())
+}
+
+/// The rows that a predicate keeps, and what is said of it.
+fn wanted(table: &Table, predicate: &Predicate) -> Result<(Vec<bool>, String), PairsError> {
     let columns = predicate.columns().iter().map(|name| Cells::of(table, name)).collect::<Result<Vec<_>, _>>()?;
     let kinds: Vec<Kind> = columns.iter().map(Cells::kind).collect();
     let bound = predicate.bind(&kinds)?;
@@ -72,13 +95,10 @@ pub(super) fn keep(table: &mut Table, predicate: &Predicate) -> Result<(), Pairs
     let wanted: Vec<bool> = (0..height).map(|row| bound.keeps(&|column| columns[column].value(row))).collect();
     let left = wanted.iter().filter(|&&wanted| wanted).count();
     if left == 0 {
-        return Err(PairsError::NothingKept {
-            predicate: predicate.text().to_owned(),
-            rows: height,
-            path: table.path(),
-        });
+        let predicate = predicate.text().to_owned();
+        return Err(PairsError::NothingKept { predicate, rows: height, path: table.path() });
     }
-    table.keep(&wanted, format!("{left} of {height} rows kept by --where {}", predicate.text()))
+    Ok((wanted, format!("{left} of {height} rows kept by --where {}", predicate.text())))
 }
 
 /// The cells of a column, as a predicate sees them.

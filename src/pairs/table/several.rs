@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use polars::prelude::{
-    BooleanChunked, Column, DataFrame, DataType, NamedFrom as _, NewChunkedArray as _, Series, TimeUnit,
+    BooleanChunked, Column, DataFrame, DataType, IdxCa, NamedFrom as _, NewChunkedArray as _, Series, TimeUnit,
 };
 
 use super::form::{TableFile, caught, unreadable};
@@ -23,6 +23,8 @@ pub(super) struct Table {
     files: Vec<(PathBuf, usize)>,
     /// The rows that are left, if some were left out.
     kept: Option<Vec<usize>>,
+    /// The rows that are wanted, where the others stay for a lag to count them.
+    wanted: Option<Vec<bool>>,
     /// What was left out.
     notes: Vec<String>,
 }
@@ -43,7 +45,7 @@ impl Table {
                 table.append(frame, path)?;
             } else {
                 let files = vec![(path.clone(), frame.height())];
-                whole = Some(Self { frame, files, kept: None, notes: Vec::new() });
+                whole = Some(Self { frame, files, kept: None, wanted: None, notes: Vec::new() });
             }
         }
         let whole = whole.ok_or_else(|| PairsError::NoFiles("no file was named".to_owned()))?;
@@ -52,7 +54,7 @@ impl Table {
 
     /// Rows of one file, or of a piece of one.
     pub(super) fn of(frame: DataFrame, path: &Path) -> Self {
-        Self { files: vec![(path.to_owned(), frame.height())], frame, kept: None, notes: Vec::new() }
+        Self { files: vec![(path.to_owned(), frame.height())], frame, kept: None, wanted: None, notes: Vec::new() }
     }
 
     /// Rows that were drawn from all those of `files`, each with the row behind its last one; `kept` says which.
@@ -62,6 +64,19 @@ impl Table {
 
     pub(super) fn column(&self, name: &str) -> Result<&Column, PairsError> {
         self.frame.column(name).map_err(unreadable("table", &self.path()))
+    }
+
+    /// The column, with nothing in the rows that are not wanted.
+    pub(super) fn values(&self, name: &str) -> Result<Column, PairsError> {
+        let column = self.column(name)?;
+        let Some(wanted) = &self.wanted else { return Ok(column.clone()) };
+        let rows: IdxCa = (0..).zip(wanted).map(|(row, &wanted)| wanted.then_some(row)).collect();
+        column.take(&rows).map_err(unreadable("table", &self.path()))
+    }
+
+    /// Which rows are wanted, where the others are still there.
+    pub(super) fn wanted(&self) -> Option<&[bool]> {
+        self.wanted.as_deref()
     }
 
     /// The first file.
@@ -89,6 +104,12 @@ impl Table {
         self.frame = self.frame.filter(&mask).map_err(unreadable("table", &self.path()))?;
         self.kept = Some((0..wanted.len()).filter(|&at| wanted[at]).collect());
         Ok(())
+    }
+
+    /// Notes the rows that are `wanted`, and keeps the others in their places.
+    pub(super) fn mark(&mut self, wanted: Vec<bool>, note: String) {
+        self.notes.push(note);
+        self.wanted = Some(wanted);
     }
 
     /// Puts the rows of another file behind; a column of both must hold the same in both.
