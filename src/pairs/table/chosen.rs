@@ -52,9 +52,20 @@ impl<'a> Chosen<'a> {
     /// counted in all rows of the part, whether they have values or not.
     pub(super) fn at_lags(&self, part: &Part) -> Vec<Result<Samples, PairsError>> {
         match self.ordered(part) {
-            Ok(mut ordered) => self.options.lags().iter().map(|&lag| self.lagged(part, &mut ordered, lag)).collect(),
+            Ok(mut ordered) => {
+                let lags = self.options.lags().iter();
+                lags.map(|&lag| self.lagged(part, &mut ordered, lag).and_then(|set| self.several(part, set))).collect()
+            }
             Err(error) => vec![Err(error)],
         }
+    }
+
+    /// One row of a part is no sample: its columns would only look constant.
+    fn several(&self, part: &Part, set: Samples) -> Result<Samples, PairsError> {
+        if part.within.is_some() && set.len() == 1 {
+            return Err(PairsError::OneRow { columns: self.columns(), path: self.path.clone() });
+        }
+        Ok(set)
     }
 
     /// The rows of a part that have a place in an episode, in order.
@@ -119,6 +130,7 @@ impl<'a> Chosen<'a> {
             notes.push(format!("{left} of {all} {what} left out: a missing value in {columns}"));
         }
         notes.extend(self.notes.iter().chain(&part.note).cloned());
+        notes.extend(self.mostly_distinct(&x_rows));
         let mut rows = x_rows;
         let (starts, mut label) = episodes(&mut rows, group.as_deref(), options);
         if let (Some(time), Some(name)) = (time, &options.time) {
@@ -194,6 +206,22 @@ impl<'a> Chosen<'a> {
             }
         }
         pairs
+    }
+
+    /// A warning per column that was asked to be words and hardly has a word twice.
+    fn mostly_distinct(&self, rows: &[usize]) -> Vec<String> {
+        let mut out = Vec::new();
+        for columns in [&self.x, &self.y, &self.z] {
+            for (c, name) in columns.names.iter().enumerate().filter(|(_, name)| self.options.words.contains(name)) {
+                let words = rows.iter().map(|&row| columns.row(row)[c].to_bits());
+                let distinct = words.collect::<std::collections::BTreeSet<_>>().len();
+                if distinct > 2 && 2 * distinct > rows.len() {
+                    out.push(format!("--words {name}: {distinct} words in {} rows: a word that stands once says nothing of another; take it as numbers, or merge words", rows.len()));
+                }
+            }
+        }
+        out.dedup();
+        out
     }
 
     fn too_short(&self, ordered: &Ordered, lag: usize) -> PairsError {

@@ -74,11 +74,16 @@ impl TableOptions {
         self.values().into_iter().chain(keys).collect()
     }
 
+    /// The columns whose values are compared or order the rows.
+    fn compared(&self) -> Vec<&str> {
+        let lists = self.x.iter().chain(&self.y).chain(&self.given).chain(&self.time);
+        lists.map(String::as_str).collect()
+    }
+
     /// The columns whose values mean something: not only that they are equal.
     fn values(&self) -> Vec<&str> {
         let filter = self.filter.iter().flat_map(Predicate::columns);
-        let lists = self.x.iter().chain(&self.y).chain(&self.given).chain(&self.time);
-        lists.chain(filter).map(String::as_str).collect()
+        self.compared().into_iter().chain(filter.map(String::as_str)).collect()
     }
 }
 
@@ -149,6 +154,7 @@ pub fn all_pairs(paths: &[PathBuf], options: &TableOptions) -> Result<(Vec<Sampl
         if !named {
             (options.x, left_out) = names::of_first(paths)?;
         }
+        few_pairs(options.x.len(), &paths[0])?;
         let (table, options) = filtered(paths, &options)?;
         let keys = options.group.iter().chain(&options.by);
         let others: Vec<&String> = options.given.iter().chain(&options.time).chain(keys).collect();
@@ -164,6 +170,7 @@ pub fn all_pairs(paths: &[PathBuf], options: &TableOptions) -> Result<(Vec<Sampl
         let rows = table.frame.height();
         let is_empty = |name: &String| table.values(name).is_ok_and(|c| c.null_count() == rows);
         let (empty, full): (Vec<String>, Vec<String>) = columns.into_iter().partition(is_empty);
+        few_pairs(full.len(), &paths[0])?;
         let (mut sets, mut last) = (Vec::new(), None);
         left_out.extend(empty.iter().map(|name| format!("column {name:?} is empty")));
         for (i, j) in (0..full.len()).flat_map(|i| (i + 1..full.len()).map(move |j| (i, j))) {
@@ -189,6 +196,17 @@ pub fn all_pairs(paths: &[PathBuf], options: &TableOptions) -> Result<(Vec<Sampl
         let columns = full.into_iter().chain(empty).collect::<Vec<_>>().join(", ");
         Err(last.unwrap_or_else(|| PairsError::NoRows { rows, columns, path: table.path() }))
     })
+}
+
+/// Most pairs of `--all-pairs`.
+const MOST_PAIRS: usize = 100_000;
+
+fn few_pairs(columns: usize, path: &Path) -> Result<(), PairsError> {
+    let pairs = columns * columns.saturating_sub(1) / 2;
+    if pairs <= MOST_PAIRS {
+        return Ok(());
+    }
+    Err(PairsError::TooManyPairs { columns, pairs, most: MOST_PAIRS, path: path.to_owned() })
 }
 
 /// The table without the rows that the filter leaves out; the options with their patterns replaced.

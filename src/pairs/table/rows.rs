@@ -4,9 +4,10 @@ use std::collections::BTreeMap;
 
 use polars::prelude::{BooleanChunked, Column, DataType, Float64Chunked, Int64Chunked, StringChunked};
 
+use super::form::unreadable;
 use super::numbers::{Holds, per_second};
 use super::order::texts;
-use super::several::Table;
+use super::several::{Table, WANTED};
 use crate::pairs::predicate::{Kind, Predicate, Value};
 use crate::pairs::{PairsError, dates};
 use crate::schema::NOTE;
@@ -75,24 +76,33 @@ pub(super) fn parts(table: &Table, by: &[String]) -> Result<Vec<Part>, PairsErro
 
 /// Leaves out the rows that a predicate does not keep, and says how many are left.
 pub(super) fn keep(table: &mut Table, predicate: &Predicate) -> Result<(), PairsError> {
-    let (wanted, note) = wanted(table, predicate)?;
+    let (wanted, note) = found(table, predicate)?;
     table.keep(&wanted, note)
 }
 
 /// The same, but the rows stay in their places, for a lag to count them.
 pub(super) fn mark(table: &mut Table, predicate: &Predicate) -> Result<(), PairsError> {
-    let (wanted, note) = wanted(table, predicate)?;
+    let (wanted, note) = found(table, predicate)?;
     table.mark(wanted, note);
     Ok(())
 }
 
-/// The rows that a predicate keeps, and what is said of it.
-fn wanted(table: &Table, predicate: &Predicate) -> Result<(Vec<bool>, String), PairsError> {
+/// Whether a predicate keeps each row.
+pub(super) fn wanted(table: &Table, predicate: &Predicate) -> Result<Vec<bool>, PairsError> {
     let columns = predicate.columns().iter().map(|name| Cells::of(table, name)).collect::<Result<Vec<_>, _>>()?;
     let kinds: Vec<Kind> = columns.iter().map(Cells::kind).collect();
     let bound = predicate.bind(&kinds)?;
     let height = table.frame.height();
-    let wanted: Vec<bool> = (0..height).map(|row| bound.keeps(&|column| columns[column].value(row))).collect();
+    Ok((0..height).map(|row| bound.keeps(&|column| columns[column].value(row))).collect())
+}
+
+/// The rows that were found to be kept when the table was read, and what is said of it.
+fn found(table: &mut Table, predicate: &Predicate) -> Result<(Vec<bool>, String), PairsError> {
+    let path = table.path();
+    let fail = unreadable("table", &path);
+    let column = table.frame.drop_in_place(WANTED).map_err(&fail)?;
+    let wanted: Vec<bool> = column.bool().map_err(&fail)?.iter().map(|wanted| wanted == Some(true)).collect();
+    let height = wanted.len();
     let left = wanted.iter().filter(|&&wanted| wanted).count();
     if left == 0 {
         let predicate = predicate.text().to_owned();
@@ -103,7 +113,9 @@ fn wanted(table: &Table, predicate: &Predicate) -> Result<(Vec<bool>, String), P
 
 /// The cells of a column, as a predicate sees them.
 enum Cells {
-    Integers(Int64Chunked),
+    /// No cell has a value: they are of any kind.
+    Nothing,
+    Integers(Vec<Option<i128>>),
     Floats(Float64Chunked, f64),
     Truths(BooleanChunked),
     Words(StringChunked),
@@ -115,6 +127,9 @@ impl Cells {
     fn of(table: &Table, name: &str) -> Result<Self, PairsError> {
         let column = table.column(name)?.rechunk();
         let kind = column.dtype().clone();
+        if column.null_count() == column.len() {
+            return Ok(Self::Nothing);
+        }
         let unfit = || super::numbers::not_numeric(table, &column);
         let cast = |kind: &DataType| -> Result<Column, PairsError> {
             column.to_physical_repr().cast(kind).ok().ok_or_else(unfit)
@@ -123,9 +138,7 @@ impl Cells {
         let floats = || Ok::<_, PairsError>(cast(&DataType::Float64)?.f64().ok().ok_or_else(unfit)?.clone());
         Ok(match Holds::of(&kind) {
             Holds::Numbers if kind.is_bool() => Self::Truths(column.bool().ok().ok_or_else(unfit)?.clone()),
-            Holds::Numbers if kind.is_integer() && integers()?.null_count() == column.null_count() => {
-                Self::Integers(integers()?)
-            }
+            Holds::Numbers if kind.is_integer() => Self::Integers(super::numbers::integers(&column).ok_or_else(unfit)?),
             Holds::Numbers => Self::Floats(floats()?, 1.0),
             Holds::Times => Self::Floats(floats()?, per_second(&kind)),
             Holds::Dates => Self::Instants(integers()?, (dates::SECOND as f64 / per_second(&kind)) as i128),
@@ -139,6 +152,7 @@ impl Cells {
 
     fn kind(&self) -> Kind {
         match self {
+            Self::Nothing => Kind::Null,
             Self::Integers(_) | Self::Floats(..) => Kind::Number,
             Self::Truths(_) => Kind::Truth,
             Self::Words(_) => Kind::Text,
@@ -148,7 +162,8 @@ impl Cells {
 
     fn value(&self, row: usize) -> Value<'_> {
         let value = match self {
-            Self::Integers(cells) => cells.get(row).map(Value::Integer),
+            Self::Nothing => None,
+            Self::Integers(cells) => cells[row].map(Value::Integer),
             Self::Floats(cells, ticks) => cells.get(row).filter(|v| !v.is_nan()).map(|v| Value::Float(v / ticks)),
             Self::Truths(cells) => cells.get(row).map(Value::Truth),
             Self::Words(cells) => cells.get(row).map(Value::Text),
