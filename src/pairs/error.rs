@@ -318,6 +318,9 @@ pub enum PairsError {
         /// File.
         path: PathBuf,
     },
+    /// A pattern of file names that matches none: as a file that is not there.
+    #[error("no file matches: {}", .0.display())]
+    NoMatch(PathBuf),
     /// No file is meant.
     #[error("{0}")]
     NoFiles(String),
