@@ -266,7 +266,8 @@ pub fn find<'a, B>(kind: &'static str, entries: &'a [Entry<B>], name: &str) -> R
 
 /// "did you mean a, b?" for the candidates nearest to `name`, or the whole list when none is near.
 pub fn did_you_mean<'a>(name: &str, candidates: impl Iterator<Item = &'a str>) -> String {
-    let mut scored: Vec<(f64, &str)> = candidates.map(|c| (strsim::jaro_winkler(name, c), c)).collect();
+    let mut scored: Vec<(f64, &str)> =
+        candidates.map(|c| (strsim::jaro_winkler(&name.to_lowercase(), &c.to_lowercase()), c)).collect();
     scored.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(b.1)));
     let near: Vec<&str> = scored.iter().filter(|(s, _)| *s > 0.75).take(3).map(|(_, c)| *c).collect();
     if near.is_empty() {

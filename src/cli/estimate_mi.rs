@@ -48,13 +48,14 @@ A table is CSV, TSV, Parquet, Arrow IPC (file, stream, Feather 2), NPY (columns 
 names of its fields) or MCAP (columns /topic.field.path of JSON and protobuf messages, and log_time;
 columns of two topics are joined where their log times are equal).
 Several files: their rows follow each other; the column file says which one a row is of.
-Text: a column is numbers, true/false, dates or words. Missing are empty cells, NA, N/A, NaN, null,
-and beside numbers or dates also none and -. A stray cell among numbers is an error: --words takes
-the column as words. Columns of words are categories: discrete and ksg-mixed take them.
+Text: a column is numbers, true/false, dates or words. Missing are empty cells, NA, N/A, #N/A, <NA>,
+n.a., NaN, NaT, null, and beside numbers or dates also none - . and ?. A stray cell among numbers is
+an error: --words takes the column as words. Columns of words are categories: discrete and ksg-mixed
+take them.
 Dates (2024-01-31, 2024-01-31T12:00:00.5+01:00) are seconds since the first of them.
 --where: = <> < <= > >=, AND, OR, NOT, BETWEEN, IN (…), IS [NOT] NULL, LIKE, + - * / %, 'text',
 '2024-01-31' beside dates, \"columns with blanks\". A missing cell is NULL, and so is what is divided
-by zero; / never rounds.
+by zero; / never rounds. Rows left out count in no column's type, but a lag counts them.
 --by: the group of a row tells its part (row, city = Rome; episode, steps 0–9).
 The rows mean:
   auto           one value: chosen by types, ties, width and size, and by what several estimators say
@@ -75,7 +76,7 @@ The rows mean:
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, group(clap::ArgGroup::new("table").args(["x", "all_pairs"]).multiple(true)))]
 pub(super) struct Args {
-    /// A rollout store (directory, .mcap or .parquet); or, with --x and --y, tables in CSV, TSV, Parquet, Arrow IPC or NPY:
+    /// A rollout store (directory, .mcap or .parquet); or, with --x and --y, tables in CSV, TSV, Parquet, Arrow IPC, NPY or MCAP:
     /// one, several, or a quoted pattern ('data/*.csv'), whose rows follow each other
     #[arg(value_name = "PATH", required = true, value_hint = ValueHint::AnyPath)]
     paths: Vec<PathBuf>,
@@ -91,7 +92,7 @@ pub(super) struct Args {
     #[arg(long, conflicts_with = "y")]
     all_pairs: bool,
     /// Rows from x to y, never across the edge of an episode: 3, or 0,1,5, or 0..10 (both ends included)
-    #[arg(long, value_name = "LAGS", default_value = "0", value_parser = lags)]
+    #[arg(long, value_name = "LAGS", default_value = "0", value_parser = lags, allow_hyphen_values = true)]
     lag: Lags,
     /// Table: columns of z; x and y are compared given z (auto, gaussian, gcmi, ksg1, ksg-mixed, discrete, infonce)
     #[arg(long, value_name = "COLUMNS", value_parser = columns, requires = "table")]
@@ -103,7 +104,7 @@ pub(super) struct Args {
     #[arg(long, value_name = "COLUMN", requires = "table")]
     time: Option<String>,
     /// Rows to use: an SQL condition over any columns, or over a store's episode, step, sender, receiver, delivered
-    #[arg(long = "where", value_name = "CONDITION")]
+    #[arg(long = "where", value_name = "CONDITION", allow_hyphen_values = true)]
     filter: Option<String>,
     /// Table: one estimate per value of these columns. Store: sender, receiver, both (the default), none: all others are
     /// pooled; step:N apart from that: N steps of the episode at a time
@@ -183,6 +184,9 @@ type Lags = Arc<[usize]>;
 fn lags(text: &str) -> Result<Lags, String> {
     let number = |text: &str| text.trim().parse::<usize>().ok().filter(|&lag| lag <= 1_000_000);
     let mut out = Vec::new();
+    if text.trim_start().starts_with('-') {
+        return Err("a lag moves y behind x: to move x behind y, swap --x and --y".to_owned());
+    }
     for part in text.split(',') {
         let range = part.split_once("..").map_or((number(part), number(part)), |(a, b)| (number(a), number(b)));
         match range {
@@ -354,6 +358,7 @@ fn options(args: &Args) -> Result<TableOptions, Error> {
         filter: args.filter.as_deref().map(Predicate::parse).transpose()?,
         sample: args.sample.map(|rows| pairs::Sample { rows: rows as usize, seeds: sample_seeds(args) }),
         by: args.by.clone(),
+        lags: args.lag.to_vec(),
     })
 }
 
@@ -363,7 +368,11 @@ fn samples(args: &Args) -> Result<Vec<Samples>, Error> {
             "--lag needs neighbouring rows, which --sample takes apart: leave out one".to_owned(),
         ));
     }
-    let (sets, by) = unlagged(args)?;
+    let paths = pairs::matching(&args.paths)?;
+    if !args.x.is_empty() || args.all_pairs {
+        return of_table(args, &paths, &options(args)?);
+    }
+    let (sets, by) = of_store(args, &paths)?;
     let (mut out, mut short, mut lagging) = (Vec::new(), Vec::new(), Lagging::default());
     let mut lagged = |set: &Samples, lag: usize| match lagging.lagged(set, lag) {
         Ok(samples) => Some(samples),
@@ -402,18 +411,27 @@ fn of_table(args: &Args, paths: &[PathBuf], options: &TableOptions) -> Result<Ve
     }
     let read = if args.all_pairs { pairs::all_pairs } else { pairs::tables };
     let (sets, left_out) = read(paths, options)?;
-    for what in left_out {
-        ui::say(&format!("note: left out: {what}"));
+    // what has the same reason is said once
+    let mut reasons: std::collections::BTreeMap<&str, Vec<&str>> = std::collections::BTreeMap::new();
+    for what in &left_out {
+        let (place, reason) = what.split_once(": ").unwrap_or(("", what));
+        reasons.entry(reason).or_default().push(place);
+    }
+    for (reason, places) in reasons {
+        match places.as_slice() {
+            [""] => ui::say(&format!("note: left out: {reason}")),
+            [one] => ui::say(&format!("note: left out: {one}: {reason}")),
+            [first, .., last] => {
+                ui::say(&format!("note: left out: {first} … {last} ({} in all): {reason}", places.len()));
+            }
+            [] => {}
+        }
     }
     Ok(sets)
 }
 
-/// The samples without a lag; and how links are to be pooled, if they are.
-fn unlagged(args: &Args) -> Result<(Vec<Samples>, Option<By>), Error> {
-    let paths = pairs::matching(&args.paths)?;
-    if !args.x.is_empty() || args.all_pairs {
-        return Ok((of_table(args, &paths, &options(args)?)?, None));
-    }
+/// The links of a store without a lag; and how they are to be pooled, if they are.
+fn of_store(args: &Args, paths: &[PathBuf]) -> Result<(Vec<Samples>, Option<By>), Error> {
     let filter = args.filter.as_deref().map(Predicate::parse).transpose()?;
     let path = &paths[0];
     if paths.len() > 1 {

@@ -57,6 +57,18 @@ pub enum PairsError {
         /// What to do.
         remedy: &'static str,
     },
+    /// No two rows so far apart have all values.
+    #[error("no pair {lag} rows apart: all {pairs} have a missing value in {columns}: {}", path.display())]
+    NoPairsApart {
+        /// Rows between x and y.
+        lag: usize,
+        /// Pairs of rows.
+        pairs: usize,
+        /// Columns asked for.
+        columns: String,
+        /// File.
+        path: PathBuf,
+    },
     /// A pattern that is none, or that no column matches.
     #[error("{pattern:?}: {message}: {}", path.display())]
     Pattern {
@@ -214,6 +226,51 @@ pub enum PairsError {
         /// File.
         path: PathBuf,
     },
+    /// Numbers or dates in a form that is not read.
+    #[error(
+        "column {name:?}, row {row}: {found:?} looks like {looks}; rewrite the column so, or give --words {name} to take it as words: {}",
+        path.display()
+    )]
+    OtherForm {
+        /// Column.
+        name: String,
+        /// 1-based row of data.
+        row: usize,
+        /// What stands there.
+        found: String,
+        /// What that may be, and how it is to be written.
+        looks: &'static str,
+        /// File.
+        path: PathBuf,
+    },
+    /// More pairs than anybody reads.
+    #[error("--all-pairs: {columns} columns have {pairs} pairs, more than {most}: name fewer with --x 'regex:…': {}", path.display())]
+    TooManyPairs {
+        /// Columns.
+        columns: usize,
+        /// Pairs of them.
+        pairs: usize,
+        /// Most pairs.
+        most: usize,
+        /// File.
+        path: PathBuf,
+    },
+    /// A part of a table with a single row.
+    #[error("1 row with values in {columns}, an estimate needs more: {}", path.display())]
+    OneRow {
+        /// Columns asked for.
+        columns: String,
+        /// File.
+        path: PathBuf,
+    },
+    /// Two columns of one name.
+    #[error("the first line names {name:?} more than once: rename one: {}", path.display())]
+    Twice {
+        /// The name.
+        name: String,
+        /// File.
+        path: PathBuf,
+    },
     /// A date beside others that have nanoseconds.
     #[error(
         "column {name:?}, row {row}: a date that nanoseconds do not reach (1677 to 2262), and other rows have such: {}",
@@ -279,6 +336,9 @@ pub enum PairsError {
         /// File.
         path: PathBuf,
     },
+    /// A pattern of file names that matches none: as a file that is not there.
+    #[error("no file matches: {}", .0.display())]
+    NoMatch(PathBuf),
     /// No file is meant.
     #[error("{0}")]
     NoFiles(String),
@@ -306,6 +366,7 @@ impl PairsError {
                 | Self::Where { .. }
                 | Self::NoFiles(_)
                 | Self::NoTime { .. }
+                | Self::TooManyPairs { .. }
                 | Self::By(_)
         )
     }

@@ -1,10 +1,10 @@
-//! The same samples with y some rows later.
+//! The samples of a store with y some steps later; those of a table are moved where its rows are read.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::PairsError;
-use crate::schema::{Columns, Exchange, NOTE, Samples};
+use crate::schema::{Columns, Exchange, Samples};
 
 /// Moves y in time. What was moved once is shared by all samples of the same columns: every link of a receiver.
 #[derive(Debug, Default)]
@@ -38,9 +38,6 @@ impl Lagging {
             self.moved.entry(place).or_insert_with(|| (Arc::clone(&samples.y), Arc::new(later(&samples.y, lag))));
         let mut out = Samples { y: Arc::clone(&moved.1), rows, ..samples.clone() };
         out.labels.y = format!("{}[+{lag}]", samples.labels.y);
-        if samples.notes.iter().any(|note| !note.starts_with(NOTE)) {
-            out.notes.push(format!("{NOTE}lag {lag} counts the rows that are left"));
-        }
         Ok(out)
     }
 }
@@ -57,10 +54,7 @@ fn later(y: &Columns, lag: usize) -> Columns {
 fn too_short(samples: &Samples, lag: usize) -> PairsError {
     let longest = samples.starts.windows(2).map(|w| w[1] - w[0]).max().unwrap_or(0);
     let longest = if samples.exchange == Exchange::Shift { samples.y.rows() } else { longest };
-    // a store says itself what its episodes are
-    let of_store = samples.labels.sender.is_some();
-    let remedy = if of_store { "give a smaller --lag" } else { "give --time or --group, or a smaller --lag" };
-    PairsError::NoLag { lag, longest, samples: samples.rows.len(), remedy }
+    PairsError::NoLag { lag, longest, samples: samples.rows.len(), remedy: "give a smaller --lag" }
 }
 
 #[cfg(test)]
@@ -96,7 +90,7 @@ mod tests {
         let error = lagged(&samples(Exchange::Episodes), 5).unwrap_err().to_string();
         assert_eq!(
             error,
-            "no pair 5 rows apart: the longest episode has 5 rows, and none of the 6 samples has so many after it; give --time or --group, or a smaller --lag"
+            "no pair 5 rows apart: the longest episode has 5 rows, and none of the 6 samples has so many after it; give a smaller --lag"
         );
     }
 

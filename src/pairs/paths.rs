@@ -9,7 +9,7 @@ use super::PairsError;
 /// for the files that it matches, in the order of their names.
 ///
 /// # Errors
-/// [`PairsError::NoFiles`] when a pattern is none, or matches nothing.
+/// [`PairsError::NoFiles`] when a pattern is none, [`PairsError::NoMatch`] when it matches nothing.
 pub fn matching(paths: &[PathBuf]) -> Result<Vec<PathBuf>, PairsError> {
     let (mut out, mut known) = (Vec::new(), BTreeSet::new());
     let mut add = |path: &Path| {
@@ -31,7 +31,7 @@ pub fn matching(paths: &[PathBuf]) -> Result<Vec<PathBuf>, PairsError> {
             add(&file.map_err(|error| fail(format!("a directory could not be read: {error}")))?);
         }
         if !matched {
-            return Err(fail("no file matches".to_owned()));
+            return Err(PairsError::NoMatch(path.clone()));
         }
     }
     Ok(out)

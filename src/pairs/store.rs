@@ -71,8 +71,8 @@ impl Links {
             let (sender, receiver) = (text(&labels.sender), text(&labels.receiver));
             let wanted = |(&row, &episode): (&u32, &u32)| {
                 let cell = |column: usize| match COLUMNS[places[column]].0 {
-                    "episode" => Value::Integer(self.episodes[episode as usize] as i64),
-                    "step" => Value::Integer(i64::from(row) - starts[episode as usize] as i64),
+                    "episode" => Value::Integer(self.episodes[episode as usize].into()),
+                    "step" => Value::Integer(i128::from(row) - starts[episode as usize] as i128),
                     "sender" => Value::Text(&sender),
                     "receiver" => Value::Text(&receiver),
                     _ => labels.delivered.map_or(Value::Null, Value::Truth),

@@ -28,6 +28,8 @@ mod signals;
 mod stats;
 mod stores;
 mod table_forms;
+mod table_input;
+mod table_lags;
 mod train;
 mod train_runs;
 mod worlds;

@@ -10,7 +10,7 @@ pub(in crate::pairs) enum Value<'a> {
     /// Missing, or neither true nor false.
     Null,
     /// An integer.
-    Integer(i64),
+    Integer(i128),
     /// A float, not NaN.
     Float(f64),
     /// A word.
@@ -108,24 +108,23 @@ fn compare(op: Compare, a: Value<'_>, b: Value<'_>) -> Option<bool> {
 /// The order of two values of a kind; none when one is missing.
 fn order(a: Value<'_>, b: Value<'_>) -> Option<Ordering> {
     match (a, b) {
-        (Value::Integer(a), Value::Integer(b)) => Some(a.cmp(&b)),
+        (Value::Integer(a), Value::Integer(b)) | (Value::Instant(a), Value::Instant(b)) => Some(a.cmp(&b)),
         (Value::Float(a), Value::Float(b)) => a.partial_cmp(&b),
         (Value::Integer(a), Value::Float(b)) => mixed(a, b),
         (Value::Float(a), Value::Integer(b)) => mixed(b, a).map(Ordering::reverse),
         (Value::Text(a), Value::Text(b)) => Some(a.cmp(b)),
         (Value::Truth(a), Value::Truth(b)) => Some(a.cmp(&b)),
-        (Value::Instant(a), Value::Instant(b)) => Some(a.cmp(&b)),
         _ => None,
     }
 }
 
 /// An integer beside a float, exactly: 2⁵³ + 1 is not 2⁵³.
-fn mixed(a: i64, b: f64) -> Option<Ordering> {
+fn mixed(a: i128, b: f64) -> Option<Ordering> {
     if b.is_nan() {
         return None;
     }
-    let whole = b.trunc(); // saturates as an i128, beyond every i64
-    let order = i128::from(a).cmp(&(whole as i128));
+    let whole = b.trunc(); // saturates as an i128, beyond every integer of a table
+    let order = a.cmp(&(whole as i128));
     Some(order.then_with(|| 0.0.partial_cmp(&(b - whole)).unwrap_or(Ordering::Equal)))
 }
 

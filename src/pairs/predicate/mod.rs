@@ -16,7 +16,7 @@ use super::PairsError;
 enum Expr {
     Column(usize),
     Null,
-    Integer(i64),
+    Integer(i128),
     Float(f64),
     Truth(bool),
     Text(String),

@@ -46,7 +46,7 @@ fn sqlite_keeps_the_same_rows() {
             bound.keeps(&|c| {
                 let cell = &row[["id", "a", "b", "s"].iter().position(|name| predicate.columns()[c] == *name).unwrap()];
                 match cell {
-                    Json::Number(number) if number.is_i64() => Value::Integer(number.as_i64().unwrap()),
+                    Json::Number(number) if number.is_i64() => Value::Integer(number.as_i64().unwrap().into()),
                     Json::Number(number) => Value::Float(number.as_f64().unwrap()),
                     Json::String(text) => Value::Text(text),
                     _ => Value::Null,
@@ -188,7 +188,7 @@ proptest! {
         for &(a, b) in &rows {
             let cell = |c: usize| {
                 let value = if predicate.columns()[c] == "a" { a } else { b };
-                value.map_or(Value::Null, Value::Integer)
+                value.map_or(Value::Null, |value: i64| Value::Integer(value.into()))
             };
             prop_assert_eq!(bound.keeps(&cell), naive(a, b), "{}: {:?} {:?}", text, a, b);
         }

@@ -8,9 +8,9 @@ use polars::prelude::{Column, DataType, NamedFrom as _, Series, StringChunked, T
 use crate::pairs::{PairsError, dates};
 
 /// What stands for no number and no date, in any case.
-const MISSING: [&str; 7] = ["", "na", "n/a", "nan", "null", "none", "-"];
+const MISSING: [&str; 13] = ["", "na", "n/a", "nan", "null", "none", "-", "#n/a", "<na>", "nat", "n.a.", ".", "?"];
 /// What stands for no word, in this case: "none" may be a category.
-const NO_WORD: [&str; 6] = ["", "NA", "N/A", "NaN", "null", "NULL"];
+const NO_WORD: [&str; 11] = ["", "NA", "N/A", "NaN", "null", "NULL", "#N/A", "<NA>", "NaT", "n.a.", "N.A."];
 
 fn is_missing(cell: &str) -> bool {
     cell.len() <= 4 && MISSING.iter().any(|token| token.eq_ignore_ascii_case(cell))
@@ -31,7 +31,7 @@ impl Cell {
     fn of(cell: &str) -> Self {
         if is_missing(cell) {
             Self::Missing
-        } else if cell.parse::<i64>().is_ok() {
+        } else if cell.parse::<i64>().is_ok() || cell.parse::<u64>().is_ok() {
             Self::Integer
         } else if cell.parse::<f64>().is_ok() {
             Self::Float
@@ -49,8 +49,30 @@ fn truth(cell: &str) -> Option<bool> {
     [("true", true), ("false", false)].into_iter().find(|(word, _)| cell.eq_ignore_ascii_case(word)).map(|(_, t)| t)
 }
 
-/// The column with the type of its cells; `as_words`: whatever they are, they are words.
-pub(super) fn typed(column: &Column, as_words: bool, path: &Path) -> Result<Column, PairsError> {
+/// A number or a date in a form that is not read, by what it looks like.
+fn other_form(cell: &str) -> Option<&'static str> {
+    let digits = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+    let parts = |mark: char| cell.split(mark).map(digits).collect::<Vec<_>>();
+    let all = |mark: char, counts: std::ops::RangeInclusive<usize>| {
+        let parts = parts(mark);
+        counts.contains(&parts.len()) && parts.iter().all(|&part| part)
+    };
+    let ends_in_year = cell.rsplit(['/', '.']).next().is_some_and(|year| year.len() == 4);
+    if all('/', 3..=3) || (all('.', 3..=3) && ends_in_year) {
+        return Some("a date, expected as 2024-01-31");
+    }
+    if all(':', 2..=3) {
+        return Some("a time of day, expected with its date as 2024-01-31T08:30:00, or as seconds");
+    }
+    let number = cell.trim_start_matches(['-', '+']);
+    let plain = number.chars().all(|c| c.is_ascii_digit() || c == '.' || c == ',');
+    (plain && number.contains(',') && number.starts_with(|c: char| c.is_ascii_digit()))
+        .then_some("a number with a comma, expected as 1234.5")
+}
+
+/// The column with the type of its cells; `as_words`: whatever they are, they are words. Only the rows `kept` decide, if
+/// some are: in the others a cell that does not fit is missing.
+pub(super) fn typed(column: &Column, as_words: bool, kept: Option<&[bool]>, path: &Path) -> Result<Column, PairsError> {
     let Ok(cells) = column.str() else { return Ok(column.clone()) };
     let name = column.name().clone();
     if as_words {
@@ -58,16 +80,24 @@ pub(super) fn typed(column: &Column, as_words: bool, path: &Path) -> Result<Colu
     }
     let trimmed = || cells.iter().map(|cell| cell.unwrap_or("").trim());
     let mut counts = [0; 6];
-    trimmed().for_each(|cell| counts[Cell::of(cell) as usize] += 1);
+    let decides = |row: usize| kept.is_none_or(|kept| kept[row]);
+    let deciding = || trimmed().enumerate().filter(|(row, _)| decides(*row));
+    deciding().for_each(|(_, cell)| counts[Cell::of(cell) as usize] += 1);
     let [_, integers, floats, truths, days, _] = counts;
-    let present = cells.len() - counts[Cell::Missing as usize];
+    let present = counts.iter().sum::<usize>() - counts[Cell::Missing as usize];
     let numbers = integers + floats;
+    let number = |cell: &str| if is_missing(cell) { None } else { cell.parse::<f64>().ok() };
     let series = if present == 0 {
         Series::full_null(name, cells.len(), &DataType::Float64)
+    } else if integers == present && deciding().any(|(_, cell)| !is_missing(cell) && cell.parse::<i64>().is_err()) {
+        if deciding().all(|(_, cell)| is_missing(cell) || cell.parse::<u64>().is_ok()) {
+            Series::new(name, trimmed().map(|cell| cell.parse::<u64>().ok()).collect::<Vec<_>>())
+        } else {
+            Series::new(name, trimmed().map(number).collect::<Vec<_>>())
+        }
     } else if integers == present {
         Series::new(name, trimmed().map(|cell| cell.parse::<i64>().ok()).collect::<Vec<_>>())
     } else if numbers == present {
-        let number = |cell: &str| if is_missing(cell) { None } else { cell.parse::<f64>().ok() };
         Series::new(name, trimmed().map(number).collect::<Vec<_>>())
     } else if truths == present {
         Series::new(name, trimmed().map(truth).collect::<Vec<_>>())
@@ -81,12 +111,17 @@ pub(super) fn typed(column: &Column, as_words: bool, path: &Path) -> Result<Colu
             Cell::Integer | Cell::Float => 2 * numbers > present,
             _ => false,
         };
-        let stray = trimmed().enumerate().find(|(_, cell)| !fits(&Cell::of(cell)));
+        let stray = deciding().find(|(_, cell)| !fits(&Cell::of(cell)));
         let (row, found) = stray.map_or((0, String::new()), |(row, cell)| (row + 1, cell.to_owned()));
         let (name, path) = (name.to_string(), path.to_owned());
         let expected = format!("{expected}, as in {count} of {present} rows");
         return Err(PairsError::Stray { name, row, found, expected, path });
     } else {
+        let other = || deciding().filter_map(|(row, cell)| Some((row, cell, other_form(cell)?)));
+        if let Some((row, cell, looks)) = other().next().filter(|_| 2 * other().count() > present) {
+            let (name, path) = (name.to_string(), path.to_owned());
+            return Err(PairsError::OtherForm { name, row: row + 1, found: cell.to_owned(), looks, path });
+        }
         words(cells, |cell| NO_WORD.contains(&cell))
     };
     Ok(series.into())
@@ -123,7 +158,7 @@ mod tests {
 
     fn of(cells: &[&str]) -> Result<(String, Vec<String>), String> {
         let column = Column::new("a".into(), cells);
-        let typed = typed(&column, false, Path::new("t.csv")).map_err(|e| e.to_string())?;
+        let typed = typed(&column, false, None, Path::new("t.csv")).map_err(|e| e.to_string())?;
         let values = (0..typed.len()).map(|i| typed.get(i).unwrap().to_string()).collect();
         Ok((typed.dtype().to_string(), values))
     }
@@ -144,6 +179,37 @@ mod tests {
             let values = values.iter().map(ToString::to_string).collect();
             assert_eq!(of(cells).unwrap(), (kind.to_owned(), values), "{cells:?}");
         }
+    }
+
+    #[test]
+    fn numbers_and_dates_in_other_forms_are_named_and_missing_ones_known() {
+        for (cell, looks) in [
+            ("0,5", "a number with a comma, expected as 1234.5"),
+            ("1.234,5", "a number with a comma, expected as 1234.5"),
+            ("-1,000", "a number with a comma, expected as 1234.5"),
+            ("31/01/2024", "a date, expected as 2024-01-31"),
+            ("31.12.2024", "a date, expected as 2024-01-31"),
+            ("08:30", "a time of day, expected with its date as 2024-01-31T08:30:00, or as seconds"),
+        ] {
+            let expected = format!(
+                "column \"a\", row 2: {cell:?} looks like {looks}; rewrite the column so, or give --words a to take it as words: t.csv"
+            );
+            assert_eq!(of(&["", cell, "x", cell]).unwrap_err(), expected);
+        }
+        assert_eq!(of(&["a,b", "1.2.30", "v1.2"]).unwrap().0, "str");
+        let missing = ["1", "#N/A", "<NA>", "NaT", "n.a.", ".", "?"];
+        assert_eq!(
+            of(&missing).unwrap(),
+            ("i64".to_owned(), ["1"].iter().chain(&["null"; 6]).map(ToString::to_string).collect())
+        );
+        assert_eq!(of(&["a", "#N/A", "?"]).unwrap().1, ["\"a\"", "null", "\"?\""]);
+    }
+
+    #[test]
+    fn only_the_kept_rows_decide() {
+        let column = Column::new("a".into(), ["1", "broken", "2", "x", "y"]);
+        let typed = typed(&column, false, Some(&[true, false, true, false, false]), Path::new("t.csv")).unwrap();
+        assert_eq!((typed.dtype().to_string().as_str(), typed.null_count()), ("i64", 3));
     }
 
     #[test]

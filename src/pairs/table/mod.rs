@@ -60,20 +60,32 @@ pub struct TableOptions {
     pub sample: Option<Sample>,
     /// Columns of whose every value there is a set of samples of its own.
     pub by: Vec<String>,
+    /// Rows from x (and z) to y, each a set of samples of its own; none: 0. They count all rows of an episode in its order,
+    /// whether those have values and the filter keeps them or not.
+    pub lags: Vec<usize>,
 }
 
 impl TableOptions {
+    fn lags(&self) -> &[usize] {
+        if self.lags.is_empty() { &[0] } else { &self.lags }
+    }
+
     /// All columns that are named.
     fn wanted(&self) -> Vec<&str> {
         let keys = self.group.iter().chain(&self.by).map(String::as_str);
         self.values().into_iter().chain(keys).collect()
     }
 
+    /// The columns whose values are compared or order the rows.
+    fn compared(&self) -> Vec<&str> {
+        let lists = self.x.iter().chain(&self.y).chain(&self.given).chain(&self.time);
+        lists.map(String::as_str).collect()
+    }
+
     /// The columns whose values mean something: not only that they are equal.
     fn values(&self) -> Vec<&str> {
         let filter = self.filter.iter().flat_map(Predicate::columns);
-        let lists = self.x.iter().chain(&self.y).chain(&self.given).chain(&self.time);
-        lists.chain(filter).map(String::as_str).collect()
+        self.compared().into_iter().chain(filter.map(String::as_str)).collect()
     }
 }
 
@@ -97,7 +109,7 @@ pub fn is_store(path: &Path) -> Result<bool, PairsError> {
 /// # Errors
 /// [`PairsError`] that names column and row.
 pub fn table(path: &Path, options: &TableOptions) -> Result<Samples, PairsError> {
-    let mut sets = tables(&[path.to_owned()], &TableOptions { by: Vec::new(), ..options.clone() })?.0;
+    let mut sets = tables(&[path.to_owned()], &TableOptions { by: Vec::new(), lags: Vec::new(), ..options.clone() })?.0;
     sets.pop().ok_or_else(|| PairsError::NoFiles("no file was named".to_owned()))
 }
 
@@ -113,11 +125,13 @@ pub fn tables(paths: &[PathBuf], options: &TableOptions) -> Result<(Vec<Samples>
         let (mut sets, mut left_out) = (Vec::new(), Vec::new());
         let mut last = None;
         for part in rows::parts(&table, &options.by)? {
-            match chosen.samples(&part) {
-                Ok(set) => sets.push(set),
-                Err(error) => {
-                    left_out.push(format!("{}: {error}", part.within.as_deref().unwrap_or("all rows")));
-                    last = Some(error);
+            for set in chosen.at_lags(&part, &mut Shared::default()) {
+                match set {
+                    Ok(set) => sets.push(set),
+                    Err(error) => {
+                        left_out.push(format!("{}: {error}", part.within.as_deref().unwrap_or("all rows")));
+                        last = Some(error);
+                    }
                 }
             }
         }
@@ -142,6 +156,7 @@ pub fn all_pairs(paths: &[PathBuf], options: &TableOptions) -> Result<(Vec<Sampl
         if !named {
             (options.x, left_out) = names::of_first(paths)?;
         }
+        few_pairs(options.x.len(), &paths[0])?;
         let (table, options) = filtered(paths, &options)?;
         let keys = options.group.iter().chain(&options.by);
         let others: Vec<&String> = options.given.iter().chain(&options.time).chain(keys).collect();
@@ -155,8 +170,9 @@ pub fn all_pairs(paths: &[PathBuf], options: &TableOptions) -> Result<(Vec<Sampl
         }
         let parts = rows::parts(&table, &options.by)?;
         let rows = table.frame.height();
-        let is_empty = |name: &String| table.frame.column(name).is_ok_and(|c| c.null_count() == rows);
+        let is_empty = |name: &String| table.values(name).is_ok_and(|c| c.null_count() == rows);
         let (empty, full): (Vec<String>, Vec<String>) = columns.into_iter().partition(is_empty);
+        few_pairs(full.len(), &paths[0])?;
         let (mut sets, mut last) = (Vec::new(), None);
         let mut shared: Vec<Shared> = parts.iter().map(|_| Shared::default()).collect();
         left_out.extend(empty.iter().map(|name| format!("column {name:?} is empty")));
@@ -165,12 +181,14 @@ pub fn all_pairs(paths: &[PathBuf], options: &TableOptions) -> Result<(Vec<Sampl
             let options = TableOptions { x, y, ..options.clone() };
             let chosen = Chosen::of(&table, &options)?;
             for (part, shared) in parts.iter().zip(&mut shared) {
-                match chosen.sharing(part, shared) {
-                    Ok(set) => sets.push(set),
-                    Err(error) => {
-                        let within = part.within.as_ref().map(|within| format!("{within}: ")).unwrap_or_default();
-                        left_out.push(format!("{within}{error}"));
-                        last = Some(error);
+                for set in chosen.at_lags(part, shared) {
+                    match set {
+                        Ok(set) => sets.push(set),
+                        Err(error) => {
+                            let within = part.within.as_ref().map(|within| format!("{within}: ")).unwrap_or_default();
+                            left_out.push(format!("{within}{error}"));
+                            last = Some(error);
+                        }
                     }
                 }
             }
@@ -181,6 +199,17 @@ pub fn all_pairs(paths: &[PathBuf], options: &TableOptions) -> Result<(Vec<Sampl
         let columns = full.into_iter().chain(empty).collect::<Vec<_>>().join(", ");
         Err(last.unwrap_or_else(|| PairsError::NoRows { rows, columns, path: table.path() }))
     })
+}
+
+/// Most pairs of `--all-pairs`.
+const MOST_PAIRS: usize = 100_000;
+
+fn few_pairs(columns: usize, path: &Path) -> Result<(), PairsError> {
+    let pairs = columns * columns.saturating_sub(1) / 2;
+    if pairs <= MOST_PAIRS {
+        return Ok(());
+    }
+    Err(PairsError::TooManyPairs { columns, pairs, most: MOST_PAIRS, path: path.to_owned() })
 }
 
 /// The table without the rows that the filter leaves out; the options with their patterns replaced.
@@ -196,7 +225,8 @@ fn filtered(paths: &[PathBuf], options: &TableOptions) -> Result<(Table, TableOp
         return Err(PairsError::EmptyTable(table.path()));
     }
     if let Some(predicate) = &options.filter {
-        rows::keep(&mut table, predicate)?;
+        let leave_out = if options.lags().iter().any(|&lag| lag > 0) { rows::mark } else { rows::keep };
+        leave_out(&mut table, predicate)?;
     }
     Ok((table, options))
 }

@@ -56,7 +56,7 @@ pub(super) fn notes(table: &Table, names: &[&str]) -> Result<Vec<String>, PairsE
         match Holds::of(table.column(name)?.dtype()) {
             Holds::Dates => out.push(format!("dates of {name} are seconds since the first of them")),
             Holds::Times => out.push(format!("times of {name} are seconds")),
-            Holds::Numbers if shift(table.column(name)?).is_some() => {
+            Holds::Numbers if shift(&table.values(name)?).is_some() => {
                 out.push(format!("integers of {name} are counted from the least of them: they do not fit a float"));
             }
             _ => {}
@@ -107,7 +107,7 @@ pub(super) fn numbers(table: &Table, names: &[String]) -> Result<Columns, PairsE
     let mut parts: Vec<(usize, Vec<f64>)> = Vec::new();
     let mut out = Columns::default();
     for name in names {
-        let column = table.column(name)?;
+        let column = &table.values(name)?;
         let words = ranks(column);
         let is_words = words.is_some();
         let (width, values, levels) = match words {
@@ -138,24 +138,30 @@ pub(super) fn numbers(table: &Table, names: &[String]) -> Result<Columns, PairsE
 /// What is taken from every integer or tick of a column before it becomes a float, so that it fits: the least of them.
 /// Dates always, since their zero means nothing; integers only when one is too large.
 fn shift(column: &Column) -> Option<i128> {
-    let ticks = column.to_physical_repr();
     let dates = Holds::of(column.dtype()) == Holds::Dates;
-    let integers = ticks.cast(&DataType::Int64).ok()?;
-    // unsigned ones beyond 2^63 stay floats
-    if !(dates || column.dtype().is_integer()) || integers.null_count() > ticks.null_count() {
+    if !(dates || column.dtype().is_integer()) {
         return None;
     }
-    let integers = integers.i64().ok()?;
+    let integers = integers(column)?;
     let least = integers.iter().flatten().min()?;
     let large = integers.iter().flatten().any(|value| value.unsigned_abs() > 1 << f64::MANTISSA_DIGITS);
-    (dates || large).then_some(i128::from(least))
+    (dates || large).then_some(*least)
+}
+
+/// The integers or ticks of a column, the unsigned ones beyond 2⁶³ too.
+pub(super) fn integers(column: &Column) -> Option<Vec<Option<i128>>> {
+    let ticks = column.to_physical_repr();
+    if let Ok(unsigned) = ticks.u64() {
+        return Some(unsigned.iter().map(|value| value.map(i128::from)).collect());
+    }
+    let signed = ticks.cast(&DataType::Int64).ok()?;
+    Some(signed.i64().ok()?.iter().map(|value| value.map(i128::from)).collect())
 }
 
 /// Integers or ticks, less `least`; a missing one is NaN.
 fn shifted(column: &Column, least: i128) -> Option<Vec<f64>> {
-    let integers = column.to_physical_repr().cast(&DataType::Int64).ok()?;
-    let value = |value: Option<i64>| value.map_or(f64::NAN, |value| (i128::from(value) - least) as f64);
-    Some(integers.i64().ok()?.iter().map(value).collect())
+    let value = |value: Option<i128>| value.map_or(f64::NAN, |value| (value - least) as f64);
+    Some(integers(column)?.into_iter().map(value).collect())
 }
 
 /// Width and row-major values of one column.

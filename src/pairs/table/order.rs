@@ -5,7 +5,7 @@ use std::cmp::Ordering;
 use polars::prelude::DataType;
 
 use super::TableOptions;
-use super::numbers::{Holds, not_numeric};
+use super::numbers::{Holds, integers, not_numeric};
 use super::several::Table;
 use crate::pairs::PairsError;
 
@@ -49,7 +49,7 @@ pub(super) fn texts(table: &Table, name: &str) -> Result<Vec<Option<String>>, Pa
 
 /// A column that orders rows. Integers and dates are compared as such: nanoseconds since 1970 do not fit a float.
 pub(super) enum Order {
-    Integers(Vec<Option<i64>>),
+    Integers(Vec<Option<i128>>),
     Floats(Vec<f64>),
 }
 
@@ -65,9 +65,8 @@ impl Order {
             return Err(unfit());
         }
         let ticks = column.to_physical_repr();
-        let integers = ticks.cast(&DataType::Int64).ok().ok_or_else(unfit)?;
-        if !ticks.dtype().is_float() && integers.null_count() == ticks.null_count() {
-            return Ok(Self::Integers(integers.i64().ok().ok_or_else(unfit)?.iter().collect()));
+        if !ticks.dtype().is_float() {
+            return Ok(Self::Integers(integers(column).ok_or_else(unfit)?));
         }
         let floats = ticks.cast(&DataType::Float64).ok().ok_or_else(unfit)?;
         Ok(Self::Floats(floats.f64().ok().ok_or_else(unfit)?.iter().map(|v| v.unwrap_or(f64::NAN)).collect()))
@@ -85,6 +84,23 @@ impl Order {
             Self::Integers(values) => values[a].cmp(&values[b]),
             // −0 and 0 are one time
             Self::Floats(values) => values[a].partial_cmp(&values[b]).unwrap_or(Ordering::Equal),
+        }
+    }
+
+    /// Whether all steps from row to row within the episodes are equal, but for rounding.
+    pub(super) fn is_even(&self, rows: &[usize], starts: &[usize]) -> bool {
+        let mut steps = (1..rows.len()).filter(|at| starts.binary_search(at).is_err());
+        match self {
+            Self::Integers(values) => {
+                let step = |at: usize| Some(values[rows[at]]? - values[rows[at - 1]]?);
+                let first = steps.next().and_then(step);
+                steps.all(|at| step(at) == first)
+            }
+            Self::Floats(values) => {
+                let step = |at: usize| values[rows[at]] - values[rows[at - 1]];
+                let first = steps.next().map_or(0.0, step);
+                steps.all(|at| (step(at) - first).abs() <= 1e-6 * first + 1e-15 * values[rows[at]].abs())
+            }
         }
     }
 

@@ -4,9 +4,10 @@ use std::collections::BTreeMap;
 
 use polars::prelude::{BooleanChunked, Column, DataType, Float64Chunked, Int64Chunked, StringChunked};
 
+use super::form::unreadable;
 use super::numbers::{Holds, per_second};
 use super::order::texts;
-use super::several::Table;
+use super::several::{Table, WANTED};
 use crate::pairs::predicate::{Kind, Predicate, Value};
 use crate::pairs::{PairsError, dates};
 use crate::schema::NOTE;
@@ -32,8 +33,10 @@ pub(super) fn parts(table: &Table, by: &[String]) -> Result<Vec<Part>, PairsErro
     let columns = by.iter().map(|name| texts(table, name)).collect::<Result<Vec<_>, _>>()?;
     let mut found: BTreeMap<Vec<&str>, Vec<usize>> = BTreeMap::new();
     let mut missing = 0;
-    for row in 0..height {
-        match columns.iter().map(|column| column[row].as_deref()).collect::<Option<Vec<_>>>() {
+    let values = |row: usize| columns.iter().map(|column| column[row].as_deref()).collect::<Option<Vec<_>>>();
+    let is_wanted = |row: usize| table.wanted().is_none_or(|wanted| wanted[row]);
+    for row in (0..height).filter(|&row| is_wanted(row)) {
+        match values(row) {
             Some(values) => found.entry(values).or_default().push(row),
             None => missing += 1,
         }
@@ -44,6 +47,16 @@ pub(super) fn parts(table: &Table, by: &[String]) -> Result<Vec<Part>, PairsErro
     if found.is_empty() {
         return Err(PairsError::NoRows { rows: height, columns: by.join(", "), path: table.path() });
     }
+    // rows that are not wanted only have their places
+    for row in (0..height).filter(|&row| !is_wanted(row)) {
+        if let Some(rows) = values(row).and_then(|values| found.get_mut(&values)) {
+            rows.push(row);
+        }
+    }
+    for rows in found.values_mut() {
+        rows.sort_unstable();
+    }
+    let height = (0..height).filter(|&row| is_wanted(row)).count();
     let note = (missing > 0)
         .then(|| format!("{NOTE}{missing} of {height} rows are in no part: a missing value in {}", by.join(", ")));
     let mut parts: Vec<(Vec<&str>, Vec<usize>)> = found.into_iter().collect();
@@ -65,25 +78,46 @@ pub(super) fn parts(table: &Table, by: &[String]) -> Result<Vec<Part>, PairsErro
 
 /// Leaves out the rows that a predicate does not keep, and says how many are left.
 pub(super) fn keep(table: &mut Table, predicate: &Predicate) -> Result<(), PairsError> {
+    let (wanted, note) = found(table, predicate)?;
+    table.keep(&wanted, note)
+}
+
+/// The same, but the rows stay in their places, for a lag to count them.
+pub(super) fn mark(table: &mut Table, predicate: &Predicate) -> Result<(), PairsError> {
+    let (wanted, note) = found(table, predicate)?;
+    table.mark(wanted, note);
+    Ok(())
+}
+
+/// Whether a predicate keeps each row.
+pub(super) fn wanted(table: &Table, predicate: &Predicate) -> Result<Vec<bool>, PairsError> {
     let columns = predicate.columns().iter().map(|name| Cells::of(table, name)).collect::<Result<Vec<_>, _>>()?;
     let kinds: Vec<Kind> = columns.iter().map(Cells::kind).collect();
     let bound = predicate.bind(&kinds)?;
     let height = table.frame.height();
-    let wanted: Vec<bool> = (0..height).map(|row| bound.keeps(&|column| columns[column].value(row))).collect();
+    Ok((0..height).map(|row| bound.keeps(&|column| columns[column].value(row))).collect())
+}
+
+/// The rows that were found to be kept when the table was read, and what is said of it.
+fn found(table: &mut Table, predicate: &Predicate) -> Result<(Vec<bool>, String), PairsError> {
+    let path = table.path();
+    let fail = unreadable("table", &path);
+    let column = table.frame.drop_in_place(WANTED).map_err(&fail)?;
+    let wanted: Vec<bool> = column.bool().map_err(&fail)?.iter().map(|wanted| wanted == Some(true)).collect();
+    let height = wanted.len();
     let left = wanted.iter().filter(|&&wanted| wanted).count();
     if left == 0 {
-        return Err(PairsError::NothingKept {
-            predicate: predicate.text().to_owned(),
-            rows: height,
-            path: table.path(),
-        });
+        let predicate = predicate.text().to_owned();
+        return Err(PairsError::NothingKept { predicate, rows: height, path: table.path() });
     }
-    table.keep(&wanted, format!("{left} of {height} rows kept by --where {}", predicate.text()))
+    Ok((wanted, format!("{left} of {height} rows kept by --where {}", predicate.text())))
 }
 
 /// The cells of a column, as a predicate sees them.
 enum Cells {
-    Integers(Int64Chunked),
+    /// No cell has a value: they are of any kind.
+    Nothing,
+    Integers(Vec<Option<i128>>),
     Floats(Float64Chunked, f64),
     Truths(BooleanChunked),
     Words(StringChunked),
@@ -97,6 +131,9 @@ impl Cells {
     fn of(table: &Table, name: &str) -> Result<Self, PairsError> {
         let column = table.column(name)?.rechunk();
         let kind = column.dtype().clone();
+        if column.null_count() == column.len() {
+            return Ok(Self::Nothing);
+        }
         let unfit = || super::numbers::not_numeric(table, &column);
         let cast = |kind: &DataType| -> Result<Column, PairsError> {
             column.to_physical_repr().cast(kind).ok().ok_or_else(unfit)
@@ -108,9 +145,7 @@ impl Cells {
         }
         Ok(match Holds::of(&kind) {
             Holds::Numbers if kind.is_bool() => Self::Truths(column.bool().ok().ok_or_else(unfit)?.clone()),
-            Holds::Numbers if kind.is_integer() && integers()?.null_count() == column.null_count() => {
-                Self::Integers(integers()?)
-            }
+            Holds::Numbers if kind.is_integer() => Self::Integers(super::numbers::integers(&column).ok_or_else(unfit)?),
             Holds::Numbers => Self::Floats(floats()?, 1.0),
             Holds::Times => Self::Floats(floats()?, per_second(&kind)),
             Holds::Dates => Self::Instants(integers()?, (dates::SECOND as f64 / per_second(&kind)) as i128),
@@ -124,22 +159,22 @@ impl Cells {
 
     fn kind(&self) -> Kind {
         match self {
+            Self::Nothing | Self::Empty => Kind::Null,
             Self::Integers(_) | Self::Floats(..) => Kind::Number,
             Self::Truths(_) => Kind::Truth,
             Self::Words(_) => Kind::Text,
             Self::Instants(..) => Kind::Instant,
-            Self::Empty => Kind::Null,
         }
     }
 
     fn value(&self, row: usize) -> Value<'_> {
         let value = match self {
-            Self::Integers(cells) => cells.get(row).map(Value::Integer),
+            Self::Nothing | Self::Empty => None,
+            Self::Integers(cells) => cells[row].map(Value::Integer),
             Self::Floats(cells, ticks) => cells.get(row).filter(|v| !v.is_nan()).map(|v| Value::Float(v / ticks)),
             Self::Truths(cells) => cells.get(row).map(Value::Truth),
             Self::Words(cells) => cells.get(row).map(Value::Text),
             Self::Instants(cells, each) => cells.get(row).map(|v| Value::Instant(i128::from(v) * each)),
-            Self::Empty => None,
         };
         value.unwrap_or(Value::Null)
     }

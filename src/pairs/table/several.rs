@@ -3,18 +3,21 @@
 use std::path::{Path, PathBuf};
 
 use polars::prelude::{
-    BooleanChunked, Column, DataFrame, DataType, NamedFrom as _, NewChunkedArray as _, Series, TimeUnit,
+    BooleanChunked, Column, DataFrame, DataType, IdxCa, NamedFrom as _, NewChunkedArray as _, Series, TimeUnit,
 };
 
 use super::form::{TableFile, caught, unreadable};
 use super::numbers::{Holds, per_second};
-use super::{TableOptions, cells, names};
-use crate::pairs::PairsError;
+use super::{TableOptions, cells, names, rows};
+use crate::pairs::{PairsError, Predicate};
 use crate::registry::did_you_mean;
 use crate::storage::{TableForm, table_form};
 
 /// The column that says which file a row is of, unless a file has one of this name itself.
 pub(super) const FILE: &str = "file";
+
+/// The column that says which rows a condition keeps, from reading until they are left out.
+pub(super) const WANTED: &str = "\u{1}where";
 
 /// Rows of one or several files.
 pub(super) struct Table {
@@ -23,6 +26,8 @@ pub(super) struct Table {
     files: Vec<(PathBuf, usize)>,
     /// The rows that are left, if some were left out.
     kept: Option<Vec<usize>>,
+    /// The rows that are wanted, where the others stay for a lag to count them.
+    wanted: Option<Vec<bool>>,
     /// What was left out.
     notes: Vec<String>,
 }
@@ -43,7 +48,7 @@ impl Table {
                 table.append(frame, path)?;
             } else {
                 let files = vec![(path.clone(), frame.height())];
-                whole = Some(Self { frame, files, kept: None, notes: Vec::new() });
+                whole = Some(Self { frame, files, kept: None, wanted: None, notes: Vec::new() });
             }
         }
         let whole = whole.ok_or_else(|| PairsError::NoFiles("no file was named".to_owned()))?;
@@ -52,7 +57,7 @@ impl Table {
 
     /// Rows of one file, or of a piece of one.
     pub(super) fn of(frame: DataFrame, path: &Path) -> Self {
-        Self { files: vec![(path.to_owned(), frame.height())], frame, kept: None, notes: Vec::new() }
+        Self { files: vec![(path.to_owned(), frame.height())], frame, kept: None, wanted: None, notes: Vec::new() }
     }
 
     /// Rows that were drawn from all those of `files`, each with the row behind its last one; `kept` says which.
@@ -62,6 +67,19 @@ impl Table {
 
     pub(super) fn column(&self, name: &str) -> Result<&Column, PairsError> {
         self.frame.column(name).map_err(unreadable("data", &self.path()))
+    }
+
+    /// The column, with nothing in the rows that are not wanted.
+    pub(super) fn values(&self, name: &str) -> Result<Column, PairsError> {
+        let column = self.column(name)?;
+        let Some(wanted) = &self.wanted else { return Ok(column.clone()) };
+        let rows: IdxCa = (0..).zip(wanted).map(|(row, &wanted)| wanted.then_some(row)).collect();
+        column.take(&rows).map_err(unreadable("table", &self.path()))
+    }
+
+    /// Which rows are wanted, where the others are still there.
+    pub(super) fn wanted(&self) -> Option<&[bool]> {
+        self.wanted.as_deref()
     }
 
     /// The first file.
@@ -89,6 +107,12 @@ impl Table {
         self.frame = self.frame.filter(&mask).map_err(unreadable("data", &self.path()))?;
         self.kept = Some((0..wanted.len()).filter(|&at| wanted[at]).collect());
         Ok(())
+    }
+
+    /// Notes the rows that are `wanted`, and keeps the others in their places.
+    pub(super) fn mark(&mut self, wanted: Vec<bool>, note: String) {
+        self.notes.push(note);
+        self.wanted = Some(wanted);
     }
 
     /// Puts the rows of another file behind; a column of both must hold the same in both.
@@ -154,6 +178,18 @@ fn no_u64(kind: &DataType) -> bool {
     kind != &DataType::UInt64
 }
 
+fn is_of(predicate: &Predicate, name: &str) -> bool {
+    predicate.columns().iter().any(|column| column == name)
+}
+
+/// Near names, or all; in quotes where blanks would not be seen.
+fn hint(name: &str, known: &[String]) -> String {
+    let is_plain = |name: &String| !name.is_empty() && !name.contains(|c: char| c.is_whitespace() || c == ',');
+    let plain = known.iter().all(is_plain);
+    let shown: Vec<String> = known.iter().map(|name| if plain { name.clone() } else { format!("{name:?}") }).collect();
+    did_you_mean(name, shown.iter().map(String::as_str))
+}
+
 /// The columns of one file that the options name, typed; and the file's own name, if that is asked for.
 pub(super) fn read(file: &dyn TableFile, path: &Path, options: &TableOptions) -> Result<DataFrame, PairsError> {
     let wanted = options.wanted();
@@ -168,9 +204,13 @@ pub(super) fn read(file: &dyn TableFile, path: &Path, options: &TableOptions) ->
             [one] if one.contains([';', '|', '\t']) => {
                 format!("its only column is {one:?}: expected commas (tabs in a .tsv) between columns")
             }
-            _ => did_you_mean(name, known.iter().map(String::as_str)),
+            _ => hint(name, &known),
         };
         return Err(PairsError::UnknownColumn { name: name.to_owned(), hint, path: path.to_owned() });
+    }
+    if let Some(name) = options.words.iter().find(|name| !has(name) && *name != FILE) {
+        let hint = hint(name, &known);
+        return Err(PairsError::UnknownColumn { name: name.clone(), hint, path: path.to_owned() });
     }
     if let Some((name, kind)) = file.unusable()?.into_iter().find(|(name, _)| columns.contains(&name.as_str())) {
         let hint = "write it as float64, an integer or text".to_owned();
@@ -183,12 +223,20 @@ pub(super) fn read(file: &dyn TableFile, path: &Path, options: &TableOptions) ->
     let mut frame = file.read(&columns)?;
     let text = matches!(table_form(path)?, TableForm::Csv | TableForm::Tsv);
     let only_group = |name: &str| !options.values().contains(&name);
-    for name in &columns {
+    let is_words = |name: &str| options.words.iter().any(|word| word == name);
+    let (cells, mut faults) = (frame.clone(), Vec::new());
+    for &name in &columns {
         let column = frame.column(name).map_err(fail())?;
-        let as_words = options.words.iter().any(|word| word == name);
         let column = match text {
-            true => cells::typed(column, as_words || only_group(name), path)?,
-            false if as_words => column.cast(&DataType::String).map_err(fail())?,
+            true => match cells::typed(column, is_words(name) || only_group(name), None, path) {
+                // a condition may leave out the rows at fault
+                Err(error) if options.filter.is_some() => {
+                    faults.push((name, error));
+                    cells::typed(column, true, None, path)?
+                }
+                typed => typed?,
+            },
+            false if is_words(name) => column.cast(&DataType::String).map_err(fail())?,
             false => continue,
         };
         frame.with_column(column).map_err(fail())?;
@@ -198,5 +246,21 @@ pub(super) fn read(file: &dyn TableFile, path: &Path, options: &TableOptions) ->
         let names = Series::new(FILE.into(), [name.as_str()]).new_from_index(0, frame.height());
         frame.with_column(names.into()).map_err(fail())?;
     }
+    let Some(predicate) = &options.filter else { return Ok(frame) };
+    let wanted = match rows::wanted(&Table::of(frame.clone(), path), predicate) {
+        // compared as what they mostly are, stray cells stay errors
+        Err(PairsError::Where { .. }) if faults.iter().any(|(name, _)| is_of(predicate, name)) => {
+            return Err(faults.remove(faults.iter().position(|(name, _)| is_of(predicate, name)).unwrap_or(0)).1);
+        }
+        wanted => wanted?,
+    };
+    let is_text = |name: &str| frame.column(name).is_ok_and(|column| column.dtype() == &DataType::String);
+    let read: Vec<&str> = columns.iter().copied().filter(|name| options.compared().contains(name)).collect();
+    let again = read.into_iter().filter(|name| text && is_text(name) && !is_words(name)).collect::<Vec<_>>();
+    for name in again {
+        let column = cells::typed(cells.column(name).map_err(fail())?, false, Some(&wanted), path)?;
+        frame.with_column(column).map_err(fail())?;
+    }
+    frame.with_column(Series::new(WANTED.into(), wanted).into()).map_err(fail())?;
     Ok(frame)
 }

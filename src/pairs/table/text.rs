@@ -34,12 +34,37 @@ impl Text {
         let options = options.map_parse_options(|options| options.with_separator(self.separator));
         let frame = options.into_reader_with_file_handle(text).finish();
         frame.map_err(|error| match self.uneven() {
+            None if error.to_string().to_lowercase().contains("utf-8") || error.to_string().contains("utf8") => {
+                let message = "it is not UTF-8 text: convert it first, for example with iconv".to_owned();
+                PairsError::Unreadable { form: self.form.name(), message, path: self.path.clone() }
+            }
             Some((row, found, expected)) => {
                 let message = format!("row {row} has {found} fields, expected {expected} as in the first line");
                 PairsError::Unreadable { form: self.form.name(), message, path: self.path.clone() }
             }
             None => unreadable(self.form.name(), &self.path)(error),
         })
+    }
+
+    /// Columns by their names as people write them.
+    fn chosen(
+        &self,
+        columns: &[&str],
+        read: impl Fn(CsvReadOptions) -> Result<DataFrame, PairsError>,
+    ) -> Result<DataFrame, PairsError> {
+        let header = names(&read(CsvReadOptions::default().with_n_rows(Some(0)))?);
+        if let Some(name) =
+            header.iter().filter_map(|name| repeats(name)).find(|name| columns.contains(&&*unescaped(name)))
+        {
+            return Err(PairsError::Twice { name: unescaped(name), path: self.path.clone() });
+        }
+        let own: Vec<&str> =
+            header.iter().map(String::as_str).filter(|name| columns.contains(&&*unescaped(name))).collect();
+        let mut frame = read(of_columns(&own))?;
+        for name in own.into_iter().filter(|name| name.contains("\"\"")) {
+            frame.rename(name, unescaped(name).into()).map_err(unreadable(self.form.name(), &self.path))?;
+        }
+        Ok(frame)
     }
 
     /// The first row of data with more fields than the first line, how many those are, and how many it may have; asked
@@ -67,11 +92,12 @@ impl Text {
 
 impl TableFile for Text {
     fn names(&self) -> Result<Vec<String>, PairsError> {
-        Ok(names(&self.finish(CsvReadOptions::default().with_n_rows(Some(0)))?))
+        let header = self.finish(CsvReadOptions::default().with_n_rows(Some(0)))?;
+        Ok(names(&header).iter().filter(|name| repeats(name).is_none()).map(|name| unescaped(name)).collect())
     }
 
     fn read(&self, columns: &[&str]) -> Result<DataFrame, PairsError> {
-        self.finish(of_columns(columns))
+        self.chosen(columns, |options| self.finish(options))
     }
 
     fn size(&self, _columns: &[&str]) -> Result<Option<u64>, PairsError> {
@@ -84,6 +110,17 @@ impl TableFile for Text {
             |text: Result<Vec<u8>, PairsError>| Ok(Box::new(Piece { of: self, text: text? }) as Box<dyn TableFile>);
         Ok(Some(Box::new(lines.map(piece))))
     }
+}
+
+/// The name that stands twice, of the second of two columns: the reader gives that one this name.
+fn repeats(name: &str) -> Option<&str> {
+    let (first, number) = name.rsplit_once("_duplicated_")?;
+    number.parse::<u32>().is_ok().then_some(first)
+}
+
+/// A name without the quotes that stand for one: the reader leaves them.
+fn unescaped(name: &str) -> String {
+    name.replace("\"\"", "\"")
 }
 
 fn of_columns(columns: &[&str]) -> CsvReadOptions {
@@ -102,11 +139,11 @@ struct Piece<'a> {
 
 impl TableFile for Piece<'_> {
     fn names(&self) -> Result<Vec<String>, PairsError> {
-        Ok(names(&self.of.parsed(Cursor::new(&self.text), CsvReadOptions::default().with_n_rows(Some(0)))?))
+        self.of.names()
     }
 
     fn read(&self, columns: &[&str]) -> Result<DataFrame, PairsError> {
-        self.of.parsed(Cursor::new(&self.text), of_columns(columns))
+        self.of.chosen(columns, |options| self.of.parsed(Cursor::new(&self.text), options))
     }
 }
 
