@@ -73,6 +73,10 @@ pub(super) fn create(trainer: &mut Trainer, force: bool) -> Result<Option<Held>,
     let dir = trainer.dir.clone();
     let partial = io::partial_path(&dir);
     drop(hold(&partial)?); // a living writer's partial is not removed
+    let own = |name: &String| RUN_FILES.contains(&name.as_str()) || is_leftover(name);
+    if partial.exists() && !names(&partial)?.iter().all(own) {
+        return Err(IoError::Foreign(partial).into()); // a recording that `recover` can still put in place
+    }
     io::remove(&partial)?;
     io::create_parent(&partial.join(CONFIG))?;
     let held = hold(&partial)?;

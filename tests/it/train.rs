@@ -263,6 +263,14 @@ fn a_kill_before_the_first_checkpoint_leaves_no_run_and_one_amid_a_write_leaves_
     let resume = Options { resume: true, ..Options::default() };
     let error = train(config("maddpg", 500), &path, &resume, &mut |_| {}, &AtomicBool::new(false)).unwrap_err();
     assert!(error.to_string().starts_with("cannot resume: there is no checkpoint; start without --resume"), "{error}");
+    // what a killed recording of this name leaves is not ours to remove
+    let journal = dir.path().join(".run.partial/journal.arrows");
+    ccmarl::io::write_atomic(&journal, b"episodes").unwrap();
+    let error = train(config("maddpg", 500), &path, &Options::default(), &mut |_| {}, &AtomicBool::new(false));
+    assert!(
+        error.unwrap_err().to_string().starts_with("refusing to replace what ccmarl did not make") && journal.exists()
+    );
+    std::fs::remove_file(&journal).unwrap();
     // what such a kill leaves
     ccmarl::io::write_atomic(&dir.path().join(".run.partial/config.toml"), b"half").unwrap();
     run(config("maddpg", 500), &path, &Options::default());
