@@ -91,7 +91,7 @@ impl Estimator for Auto {
             // the last row of `discrete` is the corrected one
             rows.extend(estimator.estimate(scored.as_ref().unwrap_or(samples), protocol, &seeds.child(name))?.pop());
         }
-        let least = rows.iter().map(|r| r.p_value).try_fold(1.0, |least: f64, p| Some(least.min(p?)));
+        let least = rows.iter().filter_map(|r| r.p_value).reduce(f64::min);
         // a copula that does not fit is no answer, and one without tails is gcmi's
         rows.retain(|r| !r.warnings.iter().any(|w| w.starts_with(MISFIT) || w.starts_with(LIGHT)));
         let values = rows.iter().map(|r| format!("{} {:.3}", r.estimator, r.value)).collect::<Vec<_>>().join(", ");

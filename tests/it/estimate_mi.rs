@@ -244,7 +244,7 @@ fn a_picture_never_takes_the_results_away() {
     }
     let (code, _, err) = run(&[&args[..], &["--plot", &at("newer/pairs.svg")]].concat());
     assert!(code == 2 && err.contains("give --force to replace it, or another --plot: "), "{code}: {err}");
-    std::fs::write(at("mine.svg"), "mine").unwrap();
+    ccmarl::io::write_atomic(at("mine.svg").as_ref(), b"mine").unwrap();
     let (code, _, err) = run(&[&args[..], &["--force", "--plot", &at("mine.svg")]].concat());
     assert!(code == 1 && err.contains("remove it by hand, or give another --plot: "), "{code}: {err}");
     let (code, out, err) = run(&[&args[..], &["--plot", &format!("{other}/pairs.png")]].concat());
@@ -344,7 +344,10 @@ fn a_table_that_memory_does_not_hold_is_read_once_and_says_what_was_estimated_ho
         assert_eq!([value(&rows[0][0]), value(&rows[1][1])], [value(&whole[0]), value(&whole[1])], "{blank:?}");
     }
     // who needs no words reads no more of them
-    let words: String = (0..40_000).map(|row| format!("w{row},1\n")).collect();
+    let mut words = String::new();
+    for row in 0..40_000 {
+        writeln!(words, "w{row},1").unwrap();
+    }
     let many = write(dir.path(), "many.csv", &format!("a,b\n{words}"));
     let (code, _, err) = run(&[many.as_str(), "--x", "a", "--y", "b", "--estimator", "gaussian", "--memory", "0"]);
     assert!(code == 2 && err.contains("a holds words"), "{code}: {err}");

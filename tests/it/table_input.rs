@@ -8,7 +8,7 @@ use ccmarl::pairs::{Predicate, TableOptions, all_pairs, tables};
 use super::estimate_mi::run;
 
 fn text(dir: &Path, name: &str, text: &str) -> String {
-    std::fs::write(dir.join(name), text).unwrap();
+    ccmarl::io::write_atomic(&dir.join(name), text.as_bytes()).unwrap();
     dir.join(name).to_string_lossy().into_owned()
 }
 
@@ -54,7 +54,7 @@ fn a_condition_leaves_out_stray_cells_and_words_that_are_numbers_are_told() {
     let (code, _, err) = run(&[&commas, "--x", "x", "--y", "y", "--words", "y", "--estimator", "ksg-mixed"]);
     assert_eq!(code, 0, "{err}");
     let latin = dir.path().join("latin.csv");
-    std::fs::write(&latin, b"x,y\n1,caf\xe9\n2,b\n3,c\n").unwrap();
+    ccmarl::io::write_atomic(latin.as_ref(), b"x,y\n1,caf\xe9\n2,b\n3,c\n").unwrap();
     let (code, _, err) = run(&[latin.to_str().unwrap(), "--x", "x", "--y", "y"]);
     assert!(code == 1 && err.contains("it is not UTF-8 text: convert it first"), "{err}");
 }

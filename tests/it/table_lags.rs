@@ -32,10 +32,12 @@ type Row = (usize, usize, Option<f64>, Option<f64>);
 fn table(rows: &[Row]) -> (tempfile::TempDir, PathBuf) {
     let cell = |value: Option<f64>| value.map(|value| value.to_string()).unwrap_or_default();
     let mut text = "t,g,x,y\n".to_owned();
-    rows.iter().for_each(|&(t, g, x, y)| writeln!(text, "{t},{g},{},{}", cell(x), cell(y)).unwrap());
+    for &(t, g, x, y) in rows {
+        writeln!(text, "{t},{g},{},{}", cell(x), cell(y)).unwrap();
+    }
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("t.csv");
-    std::fs::write(&path, text).unwrap();
+    ccmarl::io::write_atomic(path.as_ref(), text.as_bytes()).unwrap();
     (dir, path)
 }
 
