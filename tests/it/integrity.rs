@@ -315,7 +315,7 @@ fn recover_does_not_replace_a_store_without_force() {
         let leftover = killed(&other, &layout, &some(&layout, 5), 5);
         write(&path, &layout, &some(&layout, 2), false).unwrap();
         fs::rename(&leftover, partial_path(&path)).unwrap(); // as a killed `record --force` leaves it
-        assert!(matches!(recover(&path, false), Err(StorageError::Io(IoError::Exists(_)))), "{form}");
+        assert!(matches!(recover(&path, false), Err(StorageError::Beside { .. })), "{form}");
         assert_eq!(read(&path).unwrap().len(), 2);
         assert_eq!(recover(&path, true).unwrap().episodes, 5);
         assert_eq!((read(&path).unwrap().len(), names(directory.path())), (5, vec![form.to_owned()]));
