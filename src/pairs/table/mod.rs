@@ -2,7 +2,7 @@
 //!
 //! [`form`] reads a file, whatever its form; [`cells`] says what its text is; [`names`] which columns are meant;
 //! [`several`] makes one table of several files; [`numbers`] makes numbers of columns; [`order`] puts rows into episodes;
-//! [`chosen`] makes samples of them. [`pass`] does all this piece by piece, for which [`alike`] holds what is the same
+//! [`chosen`] makes samples of them. [`pass()`] does all this piece by piece, for which [`alike`] holds what is the same
 //! in all of them, and [`sample`] draws rows meanwhile.
 
 mod alike;
