@@ -26,7 +26,8 @@ Examples:
 
 Interrupted (Ctrl-C), it shows what the finished draws say and exits 4.
 The tasks are those of Czyz et al. 2023 (arXiv 2306.11078). error: mean over the seeds of |value - truth|, nats.
-covers: share of the 95 % intervals that hold the truth (a bound's interval is about its own expectation).
+covers: share of the 95 % intervals that hold the truth (a bound's interval is about its own expectation; the total
+leaves bounds out).
 right: tasks whose mean is within a tenth of the truth, or 0.03 nats.
 The checks are draws of two small kinds, the same for every --n. normal-W-W-RHO: 500 samples of W normal columns on
 either side, the first pair correlated by RHO; covers should be 95 %. series-PHI-C: 1000 rows of two AR(1) series with

@@ -39,6 +39,7 @@ use std::sync::Arc;
 
 use super::counts::Categories;
 use super::gcmi::normal_scores;
+use super::neighbours::DEPENDENT;
 use super::prepare::tied;
 use super::t_copula::{LIGHT, MISFIT};
 use super::{Build, ESTIMATORS, Estimate, Estimator, MiError, NOTE, Protocol};
@@ -94,6 +95,11 @@ impl Estimator for Auto {
         let least = rows.iter().filter_map(|r| r.p_value).reduce(f64::min);
         // a copula that does not fit is no answer, and one without tails is gcmi's
         rows.retain(|r| !r.warnings.iter().any(|w| w.starts_with(MISFIT) || w.starts_with(LIGHT)));
+        // nor is one whose neighbours tell of time, where there is another
+        let tells_of_time = |r: &Estimate| r.warnings.iter().any(|w| w.starts_with(DEPENDENT));
+        if !rows.iter().all(tells_of_time) {
+            rows.retain(|r| !tells_of_time(r));
+        }
         let values = rows.iter().map(|r| format!("{} {:.3}", r.estimator, r.value)).collect::<Vec<_>>().join(", ");
         let Some(mut row) = largest(rows) else { return Ok(Vec::new()) };
         let others = if asked > 1.0 { format!(", the largest of {values} on normal scores") } else { String::new() };

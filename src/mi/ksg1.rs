@@ -25,7 +25,8 @@
 //!
 //! Too low in many columns (25 + 25 normal columns, n = 5000: 0.15 instead of 1.02), and where the information is near
 //! its ceiling ψ(n) − ψ(k). Ties break it (see `ksg-mixed`). A bootstrap of it is invalid. Neighbours in time count as
-//! neighbours: on slow series it is too high, which the p-value sees and the interval does not.
+//! neighbours: on slow series and slow episodes it is too high. The p-value knows; where the next sample of an episode is often
+//! nearer than the k-th neighbour, that is said, there is no interval, and `auto` takes another.
 //!
 //! # Reference
 //!

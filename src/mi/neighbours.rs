@@ -10,7 +10,7 @@ use super::counts::Categories;
 use super::gaussian::{copy, determined};
 use super::given::{NO_NULL, cells, too_wide};
 use super::interval::{block_interval, t_quantile};
-use super::knn::{Points, within};
+use super::knn::{Points, Tree, within};
 use super::part::Part;
 use super::prepare::{all_tied, points, tied};
 use super::{Estimate, Kind, MiError, Protocol, Unit, p_value};
@@ -33,6 +33,12 @@ const PER_VALUE: usize = 4;
 
 /// Most values of a side of numbers that counts as discrete; more are steps of a continuous scale.
 const NUMBERS: usize = 20;
+
+/// Samples among which it is looked whether those of an episode are neighbours because they follow each other.
+const FOLLOWED: usize = 4000;
+
+/// What the warning begins with that they are.
+pub(super) const DEPENDENT: &str = "samples of an episode are each other's neighbours";
 
 /// Joint columns above which the estimate is said to be too low.
 const WIDE: usize = 8;
@@ -140,6 +146,15 @@ impl Neighbours {
         for (columns, label) in [(&samples.x, &labels.x), (&samples.y, &labels.y)] {
             warnings.extend(self.few_per_value(columns, &samples.rows, label).filter(|_| self.for_ties));
         }
+        let followed = followed(samples, [&x, &y], z.as_ref(), self.k, seeds);
+        if let Some(share) = followed {
+            (out.interval_low, out.interval_high) = (None, None);
+            warnings.push(format!(
+                "{DEPENDENT}: in {:.0} % of them the next one is nearer than the k-th neighbour, so the value is too high; take one \
+                 step per episode (of a store: --where 'step = 12'), or gcmi",
+                100.0 * share
+            ));
+        }
         if all.len() < 20 {
             warnings.push(format!("few blocks: the interval rests on {} episodes", all.len()));
         }
@@ -156,12 +171,31 @@ impl Neighbours {
         if out.value.is_finite() && value > 0.8 * ceiling {
             warnings.push(format!("near the ceiling of ψ(n) − ψ(k) = {ceiling:.2}: the truth may be far higher"));
         }
-        if width >= WIDE {
+        if width >= WIDE && followed.is_none() {
             warnings.push(format!("{width} columns: nearest neighbours see too little dependence in so many"));
         }
         out.warnings = warnings;
         Ok(out)
     }
+}
+
+/// The share of samples whose next one in the same episode is nearer than their k-th neighbour, if it is more than chance
+/// makes it: then neighbours tell of time (Theiler 1986), and the estimate is too high.
+fn followed(samples: &Samples, sides: [&Points; 2], z: Option<&Points>, k: usize, seeds: &Seeds) -> Option<f64> {
+    let part = Part::drawn(samples, FOLLOWED, &seeds.child("followed"));
+    if part.len() == part.rows.len() {
+        return None;
+    }
+    let parts: Vec<Points> = sides.into_iter().chain(z).map(|side| picked(side, &part.rows)).collect();
+    let joint = Points::joined(&parts.iter().collect::<Vec<_>>());
+    let (radii, blocks) = (Tree::new(&joint).kth(k), part.blocks());
+    let pairs: Vec<usize> = (0..joint.len() - 1).filter(|&i| blocks[i] == blocks[i + 1]).collect();
+    let is_near = |i: usize| {
+        let sides = joint.row(i).iter().zip(joint.row(i + 1));
+        sides.map(|(a, b)| (a - b).abs()).fold(0.0, f64::max) < radii[i] * (1.0 - SAME_SHARE)
+    };
+    let share = pairs.iter().filter(|&&i| is_near(i)).count() as f64 / pairs.len().max(1) as f64;
+    (share > 0.05 + 4.0 * k as f64 / joint.len() as f64).then_some(share)
 }
 
 impl Neighbours {
@@ -257,6 +291,43 @@ pub(super) mod tests {
     use crate::mi::ESTIMATORS;
     use crate::mi::run::tests::{linear_samples, samples_of};
     use crate::rng;
+
+    /// Two independent AR(1) series in episodes of ten steps.
+    fn slow(phi: f64, episodes: usize) -> Samples {
+        let mut rng = Seeds::new(8).stream("slow");
+        let mut column = || {
+            let mut rows = Vec::new();
+            for _ in 0..episodes {
+                let mut value = rng::normal(&mut rng);
+                for _ in 0..10 {
+                    rows.push(vec![value]);
+                    value = phi * value + (1.0 - phi * phi).sqrt() * rng::normal(&mut rng);
+                }
+            }
+            rows
+        };
+        let (x, y) = (column(), column());
+        Samples { starts: (0..=episodes).map(|e| 10 * e).collect::<Vec<_>>().into(), ..samples_of(&x, &y) }
+    }
+
+    #[test]
+    fn neighbours_that_tell_of_time_are_said_and_auto_takes_another() {
+        let one = |name: &str, samples: &Samples| {
+            let entry = crate::registry::find("estimator", ESTIMATORS, name).unwrap();
+            let built = (entry.build)(&Spec::new(name)).unwrap();
+            built.estimate(samples, &Protocol { permutations: 19 }, &Seeds::new(1)).unwrap().remove(0)
+        };
+        let says = |row: &Estimate| row.warnings.iter().any(|w| w.starts_with(DEPENDENT));
+        let dependent = slow(0.998, 100);
+        for name in ["ksg1", "ksg2", "ksg-mixed"] {
+            let found = one(name, &dependent);
+            assert!(found.value > 0.2 && says(&found) && found.interval_low.is_none(), "{found:?}");
+            let free = one(name, &slow(0.0, 100));
+            assert!(!says(&free) && free.interval_low.is_some(), "{free:?}");
+        }
+        let auto = one("auto", &dependent);
+        assert!(auto.value < 0.2 && !says(&auto), "{auto:?}");
+    }
 
     /// Points of two widths with correlated first columns; `levels` > 0 rounds to so many steps per unit.
     pub(in crate::mi) fn pair(n: usize, widths: [usize; 2], levels: f64, seed: u64) -> (Points, Points) {
