@@ -53,6 +53,12 @@ fn a_condition_leaves_out_stray_cells_and_words_that_are_numbers_are_told() {
     assert!(code == 1 && err.contains("looks like a number with a comma, expected as 1234.5; rewrite"), "{err}");
     let (code, _, err) = run(&[&commas, "--x", "x", "--y", "y", "--words", "y", "--estimator", "ksg-mixed"]);
     assert_eq!(code, 0, "{err}");
+    let european = text(dir.path(), "european.csv", "x;y\n0,5;1,25\n0,75;2,5\n");
+    let (code, _, err) = run(&[&european, "--x", "x", "--y", "y"]);
+    assert!(
+        code == 1 && err.contains("its columns stand between semicolons and its numbers have decimal commas"),
+        "{err}"
+    );
     let latin = dir.path().join("latin.csv");
     ccmarl::io::write_atomic(latin.as_ref(), b"x,y\n1,caf\xe9\n2,b\n3,c\n").unwrap();
     let (code, _, err) = run(&[latin.to_str().unwrap(), "--x", "x", "--y", "y"]);

@@ -1,6 +1,6 @@
 //! CSV and TSV. The first line names the columns.
 
-use std::io::{BufReader, Cursor, Read as _};
+use std::io::{BufRead as _, BufReader, Cursor, Read as _};
 use std::path::{Path, PathBuf};
 
 use polars::io::mmap::MmapBytesReader;
@@ -39,7 +39,13 @@ impl Text {
                 PairsError::Unreadable { form: self.form.name(), message, path: self.path.clone() }
             }
             Some((row, found, expected)) => {
-                let message = format!("row {row} has {found} fields, expected {expected} as in the first line");
+                let remedy = if expected == 1 && self.has_semicolons() {
+                    ": its columns stand between semicolons and its numbers have decimal commas; save it with commas \
+                     between columns and decimal points"
+                } else {
+                    ""
+                };
+                let message = format!("row {row} has {found} fields, expected {expected} as in the first line{remedy}");
                 PairsError::Unreadable { form: self.form.name(), message, path: self.path.clone() }
             }
             None => unreadable(self.form.name(), &self.path)(error),
@@ -65,6 +71,13 @@ impl Text {
             frame.rename(name, unescaped(name).into()).map_err(unreadable(self.form.name(), &self.path))?;
         }
         Ok(frame)
+    }
+
+    /// Whether the first line names columns between semicolons.
+    fn has_semicolons(&self) -> bool {
+        let mut line = Vec::new();
+        let read = open(&self.path).map(|file| BufReader::new(file.take(1 << 16)).read_until(b'\n', &mut line));
+        read.is_ok_and(|read| read.is_ok()) && line.contains(&b';')
     }
 
     /// The first row of data with more fields than the first line, how many those are, and how many it may have; asked
