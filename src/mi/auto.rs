@@ -18,13 +18,13 @@
 //! # Parameters
 //!
 //! None. Kind and interval are those of the chosen row; where a critic that learned nothing is the largest with its 0, the interval of
-//! the next, reaching to 0. The p-value is the smallest of those asked times their number
+//! the next, reaching to 0. The p-value is the smallest of those that have one, times the number of estimators asked
 //! (Bonferroni), at most 1.
 //!
 //! # When it fails
 //!
 //! The largest of several values leans upwards by about their scatter: 0.01 nats at n = 5000 without dependence, more where samples
-//! are not independent. Where all
+//! are not independent. On slow series the p-value rejects too often: 13 of 100 at φ = 0.98. Where all
 //! of them are too low it is too low: spirals in three columns and more.
 //!
 //! # Reference
@@ -35,10 +35,8 @@
 //!
 //! None: the rule is ours.
 
-use std::sync::Arc;
-
 use super::counts::Categories;
-use super::gcmi::normal_scores;
+use super::gcmi::in_scores;
 use super::neighbours::DEPENDENT;
 use super::prepare::tied;
 use super::t_copula::{LIGHT, MISFIT};
@@ -174,14 +172,10 @@ fn choose(samples: &Samples) -> Choice {
     Choice { estimators, scores: true, why: format!("{width} continuous columns, {n} samples") }
 }
 
-fn in_scores(samples: &Samples) -> Samples {
-    let scores = |columns: &Columns| Arc::new(normal_scores(columns, &samples.rows));
-    let z = samples.z.as_deref().map(scores);
-    Samples { x: scores(&samples.x), y: scores(&samples.y), z, ..samples.clone() }
-}
-
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use super::*;
     use crate::mi::run::tests::{linear_samples, samples_of};
     use crate::rng;

@@ -59,10 +59,7 @@ fn build(spec: &Spec) -> Result<Box<dyn Estimator>, RegistryError> {
 
 impl Estimator for Gcmi {
     fn estimate(&self, samples: &Samples, protocol: &Protocol, seeds: &Seeds) -> Result<Vec<Estimate>, MiError> {
-        let scores = |columns: &Columns| Arc::new(normal_scores(columns, &samples.rows));
-        let z = samples.z.as_deref().map(scores);
-        let normal = Samples { x: scores(&samples.x), y: scores(&samples.y), z, ..samples.clone() };
-        let mut row = gaussian::estimate("gcmi", &normal, *protocol, seeds)?;
+        let mut row = gaussian::estimate("gcmi", &in_scores(samples), *protocol, seeds)?;
         row.kind = Kind::LowerBound;
         row.warnings.extend(tied(samples));
         Ok(vec![row])
@@ -73,8 +70,15 @@ impl Estimator for Gcmi {
     }
 }
 
+/// The samples with every column replaced by its normal scores.
+pub(super) fn in_scores(samples: &Samples) -> Samples {
+    let scores = |columns: &Columns| Arc::new(normal_scores(columns, &samples.rows));
+    let z = samples.z.as_deref().map(scores);
+    Samples { x: scores(&samples.x), y: scores(&samples.y), z, ..samples.clone() }
+}
+
 /// Every value's place among the values of its column in `rows`, as a normal quantile; rows outside `rows` likewise.
-pub(super) fn normal_scores(columns: &Columns, rows: &[u32]) -> Columns {
+fn normal_scores(columns: &Columns, rows: &[u32]) -> Columns {
     let (normal, n) = (Normal::standard(), rows.len() as f64);
     let score = |&rank: &u32| normal.inverse_cdf(0.5 * f64::from(rank) / (n + 1.0));
     Columns::new(doubled_ranks(&columns.data, columns.width(), rows).iter().map(score).collect(), columns.names.clone())

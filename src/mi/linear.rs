@@ -121,6 +121,11 @@ pub(super) struct Cholesky {
 }
 
 impl Cholesky {
+    /// ln of the determinant, columns that the others explain left out.
+    pub(super) fn log_determinant(&self) -> f64 {
+        self.pivots.iter().filter(|p| **p > 0.0).map(|&p| libm::log(p)).sum()
+    }
+
     /// Squared Mahalanobis distance of a row from zero; `scratch` is overwritten.
     pub(super) fn distance(&self, row: &[f64], scratch: &mut Vec<f64>) -> f64 {
         let w = self.pivots.len();

@@ -150,9 +150,9 @@ impl Copula<'_> {
     /// the t distribution; one set of margins has no part in it).
     pub(super) fn information(&self) -> f64 {
         let entropy = |columns: &[usize]| {
-            let pivots = self.correlation.picked(columns).cholesky(COLLINEAR).pivots;
-            let used = pivots.iter().filter(|p| **p > 0.0).count();
-            self.tail.entropy(used) + 0.5 * pivots.iter().filter(|p| **p > 0.0).map(|&p| libm::log(p)).sum::<f64>()
+            let decomposed = self.correlation.picked(columns).cholesky(COLLINEAR);
+            let used = decomposed.pivots.iter().filter(|p| **p > 0.0).count();
+            self.tail.entropy(used) + 0.5 * decomposed.log_determinant()
         };
         let [xz, yz, z] = self.widths.parts();
         let all: Vec<usize> = (0..self.widths.all()).collect();
@@ -163,8 +163,8 @@ impl Copula<'_> {
     pub(super) fn log_likelihood(&self, rows: &[f64]) -> f64 {
         let (width, mut scratch) = (self.widths.all(), Vec::new());
         let decomposed = self.correlation.cholesky(COLLINEAR);
-        let log_det: f64 = decomposed.pivots.iter().filter(|p| **p > 0.0).map(|&p| libm::log(p)).sum();
-        let (whole, one) = (self.tail.constant(width) - 0.5 * log_det, self.tail.constant(1) * width as f64);
+        let (whole, one) =
+            (self.tail.constant(width) - 0.5 * decomposed.log_determinant(), self.tail.constant(1) * width as f64);
         let of = |row: &[f64]| {
             let margins: f64 = row.iter().map(|v| self.tail.decay(1, v * v)).sum();
             margins - self.tail.decay(width, decomposed.distance(row, &mut scratch))
@@ -185,8 +185,7 @@ impl Copula<'_> {
                 continue;
             }
             let decomposed = self.correlation.picked(columns).cholesky(COLLINEAR);
-            let log_det: f64 = decomposed.pivots.iter().filter(|p| **p > 0.0).map(|&p| libm::log(p)).sum();
-            let constant = self.tail.constant(columns.len()) - 0.5 * log_det;
+            let constant = self.tail.constant(columns.len()) - 0.5 * decomposed.log_determinant();
             for (out, row) in out.iter_mut().zip(rows.chunks_exact(self.widths.all())) {
                 part.clear();
                 part.extend(columns.iter().map(|&c| row[c]));

@@ -36,12 +36,10 @@
 //!
 //! None known: on samples of the t distribution it comes to its closed form.
 
-use std::sync::Arc;
-
 use rayon::prelude::*;
 
 use super::bounds::infonce;
-use super::gcmi::normal_scores;
+use super::gcmi::in_scores;
 use super::interval::{Scatter, block_interval, t_quantile};
 use super::linear::{Moments, Symmetric};
 use super::part::{Part, Subsampled};
@@ -96,9 +94,7 @@ fn build(spec: &Spec) -> Result<Box<dyn Estimator>, RegistryError> {
 
 impl Estimator for TCopula {
     fn estimate(&self, samples: &Samples, protocol: &Protocol, seeds: &Seeds) -> Result<Vec<Estimate>, MiError> {
-        let scores = |columns: &Columns| Arc::new(normal_scores(columns, &samples.rows));
-        let z = samples.z.as_deref().map(scores);
-        let normal = Samples { x: scores(&samples.x), y: scores(&samples.y), z, ..samples.clone() };
+        let normal = in_scores(samples);
         let gcmi = |protocol| gaussian::estimate("t-copula", &normal, protocol, seeds);
         // what refuses samples, finds copies, and stands when there are no tails
         let mut row = gcmi(Protocol { permutations: 0 })?;
